@@ -12,17 +12,17 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 ProgressCall = Callable[[str, int, int], None]
-"""``tell(stage, done, total)``"""
+"""Callback ``tell(stage, done, total)``."""
 LINE_EVERY_S = 5.0
-"""Between two lines of a stage at least, but for its first and its last one."""
+"""Least time between two lines of a stage, except its first and its last one."""
 
 
 def silent(stage: str, done: int, total: int) -> None:
-    """Tells nobody."""
+    """Progress callback without effect."""
 
 
 def counted(tell: ProgressCall, stage: str, total: int) -> Iterator[int]:
-    """0 to ``total`` - 1; tells how many are done before each, and at the end."""
+    """Yields 0 to ``total`` - 1; reports the number done before each, and at the end."""
     for done in range(total):
         tell(stage, done, total)
         yield done
@@ -31,7 +31,7 @@ def counted(tell: ProgressCall, stage: str, total: int) -> Iterator[int]:
 
 @contextmanager
 def progress_bar() -> Iterator[ProgressCall]:
-    """A bar on stderr where that is a terminal, else a line from time to time."""
+    """A bar on stderr if that is a terminal, else a line from time to time."""
     console = Console(stderr=True)
     if not console.is_terminal:
         yield progress_lines(sys.stderr)

@@ -10,7 +10,7 @@ from scipy.stats import norm
 
 
 def spread(values: npt.ArrayLike) -> dict[str, Any]:
-    """Median, 16th and 84th percentile and mean over seeds; null where no seed gave a value."""
+    """Median, 16th and 84th percentile and mean over seeds; null if no seed has a value."""
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if not finite.size:
@@ -20,7 +20,7 @@ def spread(values: npt.ArrayLike) -> dict[str, Any]:
 
 
 def wilson(successes: int, cases: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Wilson's interval of a share."""
+    """Wilson's confidence interval of a share."""
     z = float(norm.isf(0.5 * (1.0 - confidence)))
     share = successes / cases
     middle = (share + z**2 / (2 * cases)) / (1 + z**2 / cases)

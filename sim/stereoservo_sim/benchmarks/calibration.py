@@ -24,19 +24,19 @@ from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SyntheticCell, rotation, rx90, two_faces
 
 SIGMA = 0.05
-"""[px]"""
+"""Standard deviation of the pixels [px]."""
 STOPS = 20
 IMAGES = (100, 300, 1000, 3000, 10_000)
-"""About how many, for the cost an image."""
+"""Approximate numbers of images for the cost per image."""
 MARKERS = (8, 16, 32, 64)
-"""For the cost a marker, in two cameras."""
+"""Numbers of markers for the cost per marker, in two cameras."""
 MARKER_IMAGES = 1000
-"""About how many, for the cost a marker."""
+"""Approximate number of images for the cost per marker."""
 LARGEST = (64, 4, 10_000)
 """Markers, cameras and images of a large plant, fitted from ``LARGE_FROM`` repetitions on: it takes a minute."""
 LARGE_FROM = 20
 START = 30.0
-"""How far the common start of the two least squares lies from the truth [standard deviations]."""
+"""Distance of the common start of the two least squares from the truth [standard deviations]."""
 
 
 def thesis_sized() -> SyntheticCell:
@@ -100,9 +100,9 @@ def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[d
 
 
 def _per_marker(count: int, seed: int, progress: ProgressCall) -> list[dict[str, float]]:
-    """CPU time and peak memory of one fit each, in a process of its own; of the largest plant from many repetitions on.
+    """CPU time and peak memory of one fit each, in its own process; of the largest plant from many repetitions on.
 
-    The processes are forked from a small server: the peak of a child of this one would begin at its size.
+    The processes are forked from a small server, since a child of this process would start with its peak memory.
     """
     plants = [(markers, 2, MARKER_IMAGES) for markers in MARKERS]
     if count >= LARGE_FROM:
@@ -141,7 +141,9 @@ def measured_fit(markers: int, cameras: int, images: int, seed: int) -> dict[str
 def _beside_scipy(
     cell: SyntheticCell, trials: TrialData, count: int, seed: int, progress: ProgressCall
 ) -> dict[str, Any]:
-    """Duration of the metric bundle, ours and scipy's on the dense Jacobian of the same residuals, from one start."""
+    """Duration of the metric bundle adjustment, ours and scipy's on the dense Jacobian of the same residuals, from one
+    start.
+    """
     parts = framed(exact_model(cell))
     truth = RigModel(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(trials, trials.visible, trials.positions - parts.zero)

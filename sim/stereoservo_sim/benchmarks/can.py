@@ -36,10 +36,10 @@ from stereoservo_sim.progress import ProgressCall
 CYCLE = [SYNC, *COMMANDS]
 PACED_HZ = 200.0
 CYCLE_ANSWER_S = 1.0
-"""A cycle without all answers after this is lost."""
+"""Time after which a cycle without all replies is lost."""
 STOCK_OPTIONS: dict[str, str | int | float | bool] = {"sleep_after_open": 0}
 TRANSPORTS = ("virtual", "slcan_pty", "slcan_tcp", "stock_slcan_pty", "stock_slcan_tcp")
-"""``stock``: python-can's own ``slcan``, the baseline."""
+"""Transports. ``stock``: python-can's own ``slcan``, the baseline."""
 
 
 class _InlinePeer:
@@ -58,14 +58,14 @@ class _InlinePeer:
 
 
 class _Transport:
-    """A channel and, where they run in this process, its nodes."""
+    """A channel and, if they run in this process, its nodes."""
 
     def __init__(self, settings: ChannelSettings, inline: bool) -> None:
         self.channel = Channel(settings)
         self._inline = _InlinePeer(settings) if inline else None
 
     def cycle(self) -> bool:
-        """Run one cycle; False where a reply is missing."""
+        """Run one cycle; False if a reply is missing."""
         self.channel.send(CYCLE)
         if self._inline is not None:
             self._inline.answer()
@@ -110,7 +110,7 @@ def _line(transport: str) -> Iterator[_Transport]:
 
 
 def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[str, Any]:
-    """Time unpaced cycles for ``seconds``, then paced ones. ``latency_ms``: SYNC sent to the last reply."""
+    """Time cycles at full speed for ``seconds``, then at given rates. ``latency_ms``: SYNC sent to the last reply."""
     with real_time(LOOP_PRIORITY), _line(transport) as line:
         for _ in range(5):
             line.cycle()
@@ -132,7 +132,7 @@ def time_transport(transport: str, seconds: float, paced_cycles: int) -> dict[st
 
 
 def _paced(line: _Transport, cycles: int) -> list[float]:
-    """Durations [s] of each complete cycle, at the paced rate or as fast as the transport can."""
+    """Durations [s] of each complete cycle, at the given rate or as fast as the transport can."""
     latencies = []
     due = time.monotonic()
     for _ in range(cycles):
@@ -147,7 +147,7 @@ def _paced(line: _Transport, cycles: int) -> list[float]:
 # -- the driver with six drives --------------------------------------------------------------------------------
 
 SPEED = 0.05
-"""[rad/s], amplitude of the commands."""
+"""Amplitude of the commands [rad/s]."""
 SWING_S = 2.0
 LENGTHS = [0] + [6, 6, 4] * AXES
 """Data bytes of a cycle: SYNC; per drive the command, status word with position, velocity."""
@@ -165,14 +165,13 @@ TOLERANT = {
     "command_timeout_s": 1.0,
     "max_bus_load": 0.95,
 }
-"""Stalls of a shared machine are to be counted here; with a cell's own limits they would stop the arm. Heartbeats take
-next to nothing of the bus, whose limit is that of the cycle alone."""
+"""Time limits that let stalls of a shared machine be counted; with a cell's own limits they would stop the arm.
+Heartbeats use almost nothing of the bus, whose limit is that of the cycle alone.
+"""
 
 
 def bench_options(rate_hz: float) -> CanOptions:
-    """Options of the shipped cell's six CiA 402 drives, with velocity as the only feedback beside status and
-    position.
-    """
+    """Options of the shipped cell's six CiA 402 drives, with only velocity as feedback besides status and position."""
     options, _ = drives_of_cell(load_cell_file(shipped_cell_path("hil-can")))
     return msgspec.structs.replace(options, rate_hz=rate_hz, feedback=("velocity",), **TOLERANT)
 
@@ -181,7 +180,7 @@ def run_drives(rate_hz: float, seconds: float, *, bit_time: bool) -> dict[str, A
     """Timing of an enabled, moving arm for ``seconds``, with an empty loop of the same rate in its own process as
     baseline.
 
-    A fault ends the run and is a figure: ``fault``, None where there was none.
+    A fault ends the run and is part of the result: ``fault``, None if there was none.
     """
     options = bench_options(rate_hz)
     wanted = {"options": msgspec.to_builtins(options), "bit_time": bit_time}
@@ -213,7 +212,7 @@ def _told(error: DriverError) -> dict[str, str]:
 
 
 def _move(driver: CanJointDriver, rate_hz: float, seconds: float) -> dict[str, Any]:
-    """Run the caller's loop until its time or the first fault; returns counts of the bus thread."""
+    """Run the caller's loop until its end time or the first fault; returns counts of the bus thread."""
     assert driver.bus is not None
     cycles, thread = driver.master.statistics, driver.bus.statistics
     before = cycles.cycles, cycles.incomplete, thread.skipped
@@ -253,7 +252,7 @@ class _CpuMeter:
     """Measures CPU time per cycle: of the bus thread, and of the process with the caller's loop; medians of
     segments, and the whole.
 
-    A machine that others use slows some segments down; their median is a better measure of the code than the whole.
+    Other users of the machine slow some segments down; the median of segments measures the code better than the whole.
     """
 
     def __init__(self, driver: CanJointDriver) -> None:
@@ -267,7 +266,7 @@ class _CpuMeter:
         return self._statistics.cycles, process, process - time.thread_time()
 
     def look(self) -> None:
-        """Call every cycle: ends a segment when it is long enough."""
+        """Called every cycle: ends a segment when it is long enough."""
         if self._statistics.cycles - self._last[0] >= SEGMENT_CYCLES:
             now = self._read()
             self._segments.append(_per_cycle_ms(self._last, now))
@@ -298,7 +297,7 @@ def _empty_figures(process: subprocess.Popen[str]) -> dict[str, Any]:
 
 
 class _Pump(Subscriptions):
-    """A link for the bring-up and the cycle after it, in one thread."""
+    """A link for bring-up and the subsequent cycle, in one thread."""
 
     def __init__(self, channel: Channel) -> None:
         super().__init__()
@@ -326,8 +325,7 @@ class _Pump(Subscriptions):
 
 
 def saturate(seconds: float) -> dict[str, Any]:
-    """Highest cycle rate with frames that take their time on the wire: each cycle starts as soon as all replies are
-    in.
+    """Highest cycle rate with bit times on the wire: each cycle starts as soon as all replies have arrived.
 
     ``bus_busy``: share of the time that the bits of all frames took, by their exact lengths.
     """
@@ -380,7 +378,7 @@ def _answered(codec: Codec, pump: _Pump) -> bool:
 
 
 def fastest_paced(rates_hz: list[float], seconds: float) -> dict[str, Any]:
-    """Highest of ``rates_hz`` (ascending) that the driver holds with frames that take their time on the wire."""
+    """Highest of ``rates_hz`` (ascending) that the driver holds with bit times on the wire."""
     limit = cycle_load(LENGTHS, 1.0, 1_000_000).max_rate_hz
     trials = []
     held = 0.0
@@ -399,20 +397,20 @@ def fastest_paced(rates_hz: list[float], seconds: float) -> dict[str, Any]:
 # -- the bench -------------------------------------------------------------------------------------------------
 
 BACK_TO_BACK_S = 0.2
-"""For each repetition, of every transport."""
+"""Duration per repetition, for each transport."""
 PACED_CYCLES = 20
 DRIVES_S = 10.0 / 7.0
-"""For each repetition, at 250 Hz: 10 s unless asked otherwise, 60 s with 42 repetitions."""
+"""Duration per repetition, at 250 Hz: 10 s by default, 60 s with 42 repetitions."""
 PACED_S = 3.0 / 7.0
 PACED_RATES_HZ = [400.0, 425.0, 450.0]
-"""On a fixed grid, of the 499 Hz that the bus can carry at worst."""
+"""Rates on a fixed grid; the bus can carry 499 Hz in the worst case."""
 TARGETS = {
     "six_drives_over_tcp.skipped_cycles": "no more than empty_loop.missed",
     "six_drives_over_tcp.cpu_ms_per_cycle.bus_thread": "at most 0.3",
     "with_bit_times.back_to_back.share_of_limit": "at least 0.9",
     "with_bit_times.on_a_grid.held_hz": "449 or more: 0.9 of the bus's limit, with 99 % of its cycles complete",
 }
-"""What the figures are compared with; the bench itself does not judge."""
+"""Values to compare the results with; the bench itself does not judge."""
 
 
 def run_can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:

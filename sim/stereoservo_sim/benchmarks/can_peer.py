@@ -1,7 +1,8 @@
 """Peer processes of ``bench can``: an adapter with six replying nodes, emulated drives, an empty loop.
 
 Run as a module with ``echo tcp|pty``, ``drives OPTIONS`` (JSON) or ``empty RATE_HZ SECONDS``. The first line on stdout
-says where they listen; they end with their stdin. The empty loop is ``ready`` then and begins with a line on stdin.
+states the listening address; they end with their stdin. The empty loop prints ``ready`` and starts with a line on
+stdin.
 """
 
 from __future__ import annotations
@@ -32,10 +33,11 @@ COMMANDS = [CanFrame(0x200 + node, bytes(6)) for node in range(1, AXES + 1)]
 ANSWERS = [
     CanFrame(base + node, bytes(length)) for base, length in ((0x180, 6), (0x280, 4)) for node in range(1, AXES + 1)
 ]
-"""To a SYNC: status word and position, then velocity."""
+"""Replies to a SYNC: status word and position, then velocity."""
 ENDING_S = 10.0
 LOOP_PRIORITY, DRIVES_PRIORITY = 50, 5
-"""SCHED_FIFO of the driver's process and the empty loop (the default of a cell), and of the emulated drives."""
+"""SCHED_FIFO priority of the driver's process and the empty loop (the default of a cell), and of the emulated drives.
+"""
 
 
 @contextmanager
@@ -82,7 +84,7 @@ def serve_echo(kind: str) -> None:
     with (
         real_time(DRIVES_PRIORITY),
         suppress(ConnectionError),
-    ):  # the host may go before it has read everything
+    ):  # the host may disconnect before it has read everything
         _answer_syncs(fd)
 
 
@@ -126,7 +128,7 @@ def serve_drives(text: str) -> None:
 def empty_loop(rate_hz: float, seconds: float) -> dict[str, Any]:
     """Run a loop that only waits for absolute deadlines: its lateness [µs], and the slots it missed.
 
-    A slot is missed as the drivers' bus thread misses it: when more than half of its period is over.
+    A slot counts as missed as in the drivers' bus thread: when more than half of its period is over.
     """
     period = round(1e9 / rate_hz)
     slots = round(rate_hz * seconds)

@@ -1,5 +1,5 @@
-"""A servo core in virtual time before a synthetic cell, and bodies of many markers, for benchmarks and for tests of how
-a step's work grows.
+"""A servo core in virtual time before a synthetic cell, and bodies of many markers, for benchmarks and for tests of
+the growth of a step's cost.
 """
 
 from __future__ import annotations
@@ -34,15 +34,15 @@ from stereoservo_sim.world.synthetic import (
 )
 
 RATE_HZ, FRAME_EVERY = 250.0, 10
-"""Of the loop, and steps between images."""
+"""Rate of the loop, and steps between images."""
 PLANNING = 5000
-"""Steps in which a goal must be answered."""
+"""Number of steps in which a goal must be accepted or refused."""
 
 
 class CoreLoop:
     """A core in virtual time with perfect joints, and noise-free images that are one frame late.
 
-    ``times``: kind (`kind_of_step`) and CPU time [s] of each step: what it computes, whatever else the machine does.
+    ``times``: kind (`kind_of_step`) and CPU time [s] of each step, independent of other load on the machine.
     """
 
     def __init__(self, cell: SyntheticCell, seed: int, model: CellModel | None = None) -> None:
@@ -53,9 +53,9 @@ class CoreLoop:
         self.pending: tuple[CameraObservation, ...] = ()
         self.times: list[tuple[str, float]] = []
         self.kind = ""
-        """Of the newest step."""
+        """Kind of the newest step."""
         self.shift_px = 0.0
-        """By which the first camera's pixels are off, as if it had been pushed."""
+        """Shift of the first camera's pixels, as if it had been pushed."""
 
     def step(self, **inputs: Any) -> StepOutputs:
         """Run and time one step; then the arm moves as commanded."""
@@ -85,15 +85,15 @@ class CoreLoop:
         return outputs
 
     def before(self, kind: str, inputs: StepInputs) -> None:
-        """What a test does before a step of this ``kind``: nothing here."""
+        """Hook for tests, called before a step of this ``kind``; does nothing here."""
 
     def take_model(self) -> None:
-        """Put the model in use, and enable."""
+        """Set the model, and enable."""
         self.step(model_update=ModelUpdate(self.model))
         self.step(requests=(Request(1, "bench", Enable()),))
 
     def target_at(self, share: float) -> FeatureTarget:
-        """Set-points of the markers as they are at home plus a ``share`` of the ranges."""
+        """Set-points of the markers at home plus a ``share`` of the ranges."""
         seen = self.cell.pixels((self.cell.home + share * self.cell.ranges)[None])[:, 0]
         return FeatureTarget(
             {
@@ -103,16 +103,16 @@ class CoreLoop:
         )
 
     def start_goal(self, law: LawName, number: int = 0, share: float = 0.3) -> None:
-        """Go for a goal at a ``share`` of the ranges, far enough that the arm is under way for long; the first one
-        takes the model before.
+        """Start a goal at a ``share`` of the ranges, far enough that the arm moves for long; sets the model before the
+        first.
 
-        Others preempt the one before them.
+        Later goals preempt the previous one.
         """
         if number == 0:
             self.take_model()
         goal = Goal(str(uuid.UUID(int=self.seed + 1 + number)), self.target_at(share), law=law, gain=0.2)
         outputs = self.step(requests=(Request(2 + number, "bench", RunGoal(goal)),))
-        for _ in range(PLANNING):  # it is planned, a slice a step, before it is answered
+        for _ in range(PLANNING):  # planning takes a slice per step; the reply follows
             replies = [event for event in outputs.events if event.kind == "reply"]
             if replies:
                 break
@@ -121,7 +121,7 @@ class CoreLoop:
             raise RuntimeError(f"the core did not take the goal: {[event.message for event in replies]}")
 
     def move_goal(self, number: int) -> None:
-        """Move the active goal's set-points a little, and take a step."""
+        """Move the active goal's set-points a little, and run a step."""
         goal = self.core.state.source
         if not isinstance(goal, ServoGoal):
             raise RuntimeError("no goal is active")
@@ -148,8 +148,8 @@ CORE_STAGES = ("put_inputs", "observe", "move", "command", "finish_step", "statu
 
 @contextmanager
 def timed_stages(loop: CoreLoop) -> Iterator[dict[str, list[tuple[str, float]]]]:
-    """Meanwhile, kind and CPU time [s] of every part of the steps of ``loop``, by part; the clock itself costs some
-    0.3 µs a part.
+    """Context manager: kind and CPU time [s] of every part of the steps of ``loop``, by part; the clock itself costs
+    some 0.3 µs a part.
     """
     stages = {name: getattr(servo_core, name) for name in CORE_STAGES}
     found: dict[str, list[tuple[str, float]]] = {name: [] for name in CORE_STAGES}
@@ -179,8 +179,8 @@ STAGES = ("way in images", "arm on way", "arm without limits", "straight in join
 
 
 def kind_of_step(inputs: StepInputs, state: CoreState) -> str:
-    """What a step has to do: ``model`` (taken), ``goal`` (looked at), ``update`` (of its set-points); of a goal that is
-    looked at, a part of ``PARTS``, ``way begun``, a stage of ``STAGES``, ``told`` (its plan, and its start); ``frames``
+    """Kind of a step, by its work: ``model`` (set), ``goal`` (examined), ``update`` (of its set-points); of an examined
+    goal a part of ``PARTS``, ``way begun``, a stage of ``STAGES``, ``told`` (its plan, and its start); ``frames``
     (of all cameras), ``between`` them. While a law drives the arm they begin with ``moving``.
     """
     moving = "moving, " if isinstance(state.source, ServoGoal) else ""
@@ -202,7 +202,7 @@ def _work(inputs: StepInputs, job: PlanJob | None) -> str:
 
 
 def largest_cell() -> SyntheticCell:
-    """A cell of 256 markers, 8 cameras and 12 joints, the most that there may be: the body of `rx90_with_facets`."""
+    """A cell of 256 markers, 8 cameras and 12 joints, the largest allowed: the body of `rx90_with_facets`."""
     small = rx90_with_facets(256, 8)
     rows = [(0.7 * a, alpha, 0.7 * d) for a, alpha, d in SEVEN_ROWS[:-1]]
     wrist = [(0, 90, 0.08), (0, 90, 0.05), (0, -90, 0.05), (0.05, 90, 0), (0, -90, 0.05), (0, 0, 0.05)]
@@ -215,7 +215,7 @@ def largest_cell() -> SyntheticCell:
 
 
 def rx90_with_facets(markers: int, cameras: int) -> SyntheticCell:
-    """The 6R cell with a body of small facets of four markers on a dome, before so many cameras."""
+    """The 6R cell with a body of small facets of four markers each on a dome, before the given number of cameras."""
     side = math.ceil(math.sqrt(markers / 4))
     offsets = (np.arange(side) - 0.5 * (side - 1)) * min(0.03, 0.24 / side)
     dots = np.array([(-9, -8), (8, -9), (9, 8), (-8, 9)]) / 1000 * min(1.0, 8 / side)

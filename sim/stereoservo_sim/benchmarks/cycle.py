@@ -1,7 +1,7 @@
 """``bench cycle``: duration of the stereo control step (kernels and numpy) and of whole steps of the servo core.
 
-``bench scale``: how the cost of a step of the core grows with markers, cameras and joints: microseconds tight and
-paced, between frames and with them, and the exponent of a power law through them, an axis at a time.
+``bench scale``: growth of a core step's cost with markers, cameras and joints: microseconds back to back (tight) and
+with pauses (paced), between frames and with them, and the exponent of a fitted power law along each axis.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from stereoservo_sim.world.synthetic import SyntheticCell, rx90
 
 GAIN, DAMPING = 1.0, 1e-6
 WARM_UP = 100
-"""Steps of the core that do not count."""
+"""Steps of the core that are not timed."""
 LARGE_BODIES = ((8, 2, 6), (64, 2, 6), (256, 2, 6), (256, 8, 6), (256, 8, 12))
 """Markers, cameras, joints."""
 
@@ -159,12 +159,12 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 
 PACED_S = 0.003
-"""Sleep between two steps, as in life: caches are cold then."""
+"""Sleep between two steps, as in operation: caches are cold then."""
 KINDS = {"moving, between": "between frames", "moving, frames": "with frames"}
 
 
 class ServoLoop(CoreLoop):
-    """A loop that times what the servo process does in every cycle: the step, its command, and what a recording keeps;
+    """A loop that times the work of the servo process in every cycle: the step, its command, and its recorded data;
     status and priors are made when they are due.
     """
 
@@ -179,7 +179,7 @@ class ServoLoop(CoreLoop):
 
 def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
     """Microseconds of ``count`` steps between frames, and of those with frames of all cameras, of a core that drives
-    the simulated arm to a goal by ``law``: one after the other (``tight``), with a sleep before each (``paced``), and
+    the simulated arm to a goal by ``law``: back to back (``tight``), with a sleep before each (``paced``), and
     by stage (``stages``, medians, tight).
     """
     loop = ServoLoop(rx90(), seed)
@@ -199,8 +199,8 @@ def core_steps(law: LawName, count: int, seed: int) -> dict[str, Any]:
 
 
 def drive(loop: CoreLoop, law: LawName, count: int, pause_s: float = 0.0) -> None:
-    """Run ``count`` steps between frames, and those with frames, while ``law`` drives the arm, to and fro where it gets
-    there; with a pause before each.
+    """Run ``count`` steps between frames, and those with frames, while ``law`` drives the arm, back and forth when it
+    reaches its goal; with a pause before each.
     """
     between = 0
     while between < count:
@@ -225,8 +225,8 @@ GOALS, UPDATES, UPDATED_STEPS = 20, 20, 7
 
 
 def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str, Any]]:
-    """Microseconds of each kind of core step, by the number of markers, cameras and joints, with goals that preempt one
-    another while the arm moves and goals that are moved; and of finding the markers' planes.
+    """Microseconds of each kind of core step, by the number of markers, cameras and joints; with goals that preempt one
+    another while the arm moves, and moved goals; and of finding the markers' planes.
     """
     rows = []
     for markers, cameras, joints in LARGE_BODIES:
@@ -260,16 +260,16 @@ def large_bodies(count: int, seed: int, progress: ProgressCall) -> list[dict[str
     return rows
 
 
-# -- how a step's cost grows -----------------------------------------------------------------------------------
+# -- growth of a step's cost ----------------------------------------------------------------------------------
 
 LAW: LawName = "stereo"
 MARKERS, CAMERAS, JOINTS = (4, 16, 64, 256), (1, 2, 4, 8), (1, 2, 4, 8, 12)
 OTHER_MARKERS, OTHER_CAMERAS = 16, 2
-"""What stands still while another axis grows; six joints then."""
+"""Fixed sizes while another axis grows; six joints then."""
 
 
 def run_scale(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Step costs along each axis, with the exponents that are fitted to them."""
+    """Step costs along each axis, with the fitted exponents."""
     axes: dict[str, tuple[Sequence[int], Callable[[int], SyntheticCell]]] = {
         "markers": (MARKERS, with_markers),
         "cameras": (CAMERAS, lambda n: rx90_with_facets(OTHER_MARKERS, n)),
@@ -298,7 +298,7 @@ def with_markers(count: int) -> SyntheticCell:
 
 
 def with_joints(count: int) -> SyntheticCell:
-    """The last links of the largest cell's arm, as many as asked for, with the body of `rx90_with_facets` before two
+    """The last links of the largest cell's arm, as many as requested, with the body of `rx90_with_facets` before two
     cameras.
     """
     small, large = rx90_with_facets(OTHER_MARKERS, OTHER_CAMERAS), largest_cell()
@@ -331,8 +331,8 @@ def step_costs(cell: SyntheticCell, count: int, seed: int) -> dict[str, Any]:
 
 
 def exponents(axis: str, rows: list[dict[str, Any]]) -> dict[str, dict[str, float]]:
-    """Exponents of power laws: ``all`` is fitted to all sizes, ``last`` to the two largest, where what does not grow
-    hides least.
+    """Exponents of power laws: ``all`` is fitted to all sizes, ``last`` to the two largest, where constant costs matter
+    least.
     """
     sizes = [row[axis] for row in rows]
     found: dict[str, dict[str, float]] = {}

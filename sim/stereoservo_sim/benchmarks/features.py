@@ -1,10 +1,10 @@
 """``bench features``: duration of dot detection on simulated images (tracking, acquisition), with OpenCV labelling
-as a baseline; detection rate and accuracy under light, lens, sensor and clutter effects; processor time of the detector
-`aruco` on twelve tags, with and without a prior, beside OpenCV's own detector, and how far its corners are off.
+as a baseline; detection rate and accuracy under light, lens, sensor and clutter effects; CPU time and corner accuracy
+of the detector `aruco` on twelve tags, with and without a prior, beside OpenCV's own detector.
 
 Synthetic images are of the default faces, with known dot centres. A dot is an ellipse drawn by area coverage on a grid
-of FINE points a pixel, blurred there as a lens does it (before the pixels sample it), lit, and only then given noise
-and whole grey levels.
+of FINE points a pixel, blurred there as by a lens (before pixel sampling), lit, and then noise and quantisation are
+applied.
 """
 
 from __future__ import annotations
@@ -35,16 +35,18 @@ FINE = 4
 WIDTH, HEIGHT, FOCAL = 640, 480, 1000.0
 BLACK, WHITE = 30.0, 220.0
 CLEAR_PX = 6.0
-"""Least gap between clutter and a face's dots; what touches them hides them, which is another test."""
+"""Least gap between clutter and a face's dots; clutter that touches dots occludes them, which is a separate test."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """``tilt`` up to it [deg], ``distance`` [m] between two bounds, ``blur`` [px], ``noise`` [grey levels],
-    ``gradient`` of the light lost from the left border to the right, ``clutter`` dots, ``banding`` amplitude over
-    ``band_rows`` rows, ``shot`` variance a grey level [levels], ``gain`` of the light between two bounds (255 is
-    white), ``cut``: depth to which a dark edge covers one dot of each face [px], ``jpeg`` quality (0: none),
-    ``motion`` [px]. ``drawn``: blur, noise, gradient and clutter of each picture are uniform between none and these.
+    """Conditions of an image.
+
+    ``tilt``: largest [deg]; ``distance`` [m] between two bounds; ``blur`` [px]; ``noise`` [grey levels]; ``gradient``:
+    share of the light lost from the left border to the right; ``clutter``: dots; ``banding``: amplitude over
+    ``band_rows`` rows; ``shot``: variance per grey level [levels]; ``gain`` of the light between two bounds (255 is
+    white); ``cut``: depth to which a dark edge covers one dot of each face [px]; ``jpeg``: quality (0: none);
+    ``motion`` [px]. ``drawn``: blur, noise, gradient and clutter of each image are uniform between none and these.
     """
 
     tilt: float = 50.0
@@ -63,7 +65,7 @@ class Conditions:
     drawn: bool = False
 
     def of_a_picture(self, rng: np.random.Generator) -> Conditions:
-        """The conditions of one picture."""
+        """The conditions of one image."""
         if not self.drawn:
             return self
         blur, noise, gradient = rng.uniform(0.0, 1.0, 3) * (self.blur, self.noise, self.gradient)
@@ -97,7 +99,7 @@ def circle_conic(H: FloatArray, centre: FloatArray, radius: float) -> FloatArray
 
 
 def random_picture(conditions: Conditions, rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
-    """A picture (HEIGHT, WIDTH) with both faces side by side and its dots' centres (14, 2) [px]."""
+    """An image (HEIGHT, WIDTH) with both faces side by side and its dots' centres (14, 2) [px]."""
     conditions = conditions.of_a_picture(rng)
     z = rng.uniform(*conditions.distance)
     image = np.full((HEIGHT, WIDTH), BLACK, np.float32)
@@ -142,7 +144,7 @@ def add_ellipse(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: floa
     half = np.sqrt(np.diag(np.linalg.inv(conic[:2, :2])) * level) + 5.0 * blur + 1.0
     u0, v0 = np.floor(centre - half).astype(int)
     u1, v1 = np.ceil(centre + half).astype(int) + 1
-    # fine point i of the patch stands at u0 - 1/2 + (i + 1/2) / FINE
+    # fine point i of the patch is at u0 - 1/2 + (i + 1/2) / FINE
     start = 0.5 / FINE - 0.5
     to_pixels = np.array([[1 / FINE, 0, u0 + start], [0, 1 / FINE, v0 + start], [0, 0, 1]])
     fine = np.zeros(((v1 - v0) * FINE, (u1 - u0) * FINE), np.float32)
@@ -156,9 +158,7 @@ def add_ellipse(coverage: npt.NDArray[np.float32], conic: FloatArray, blur: floa
 
 
 def _cover(image: npt.NDArray[np.float32], conic: FloatArray, conditions: Conditions, rng: np.random.Generator) -> None:
-    """Cover an ellipse from one side, to the depth of the cut, by something dark with an edge as blurred as the
-    dots'.
-    """
+    """Cover an ellipse from one side, to the depth of the cut, by a dark area with an edge as blurred as the dots'."""
     centre = -np.linalg.solve(conic[:2, :2], conic[:2, 2])
     level = -(conic[2, 2] + conic[:2, 2] @ centre)
     angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -203,7 +203,7 @@ def _moved(image: npt.NDArray[np.float32], length: float, angle: float) -> npt.N
     return moved
 
 
-# -- how well dots are found -----------------------------------------------------------------------------------
+# -- detection rate and accuracy of dots -------------------------------------------------------------------------
 
 NEAR = (0.8, 1.2)
 """Distances [m] at which a dot's diameter is 13 to 20 px; 1.6 m: 10 px."""
@@ -233,7 +233,7 @@ TESTED: dict[str, Conditions] = {
     "jpeg 75": Conditions(jpeg=75),
     "jpeg 50": Conditions(jpeg=50),
 }
-"""Dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur where nothing else is stated."""
+"""Default: dots of 10 px, tilts to 50 degrees, 2 grey levels of noise, 0.7 px of blur."""
 REFERENCE_PX = {
     "n0": 0.011,
     "n2 b.7": 0.013,
@@ -243,9 +243,9 @@ REFERENCE_PX = {
     "n2 b.7 g50%": 0.017,
     "n5 b1.5 g50%": 0.035,
 }
-"""Thresholded components with weighted centroids (OpenCV), measured on pictures of this kind beforehand."""
+"""Errors of thresholded components with weighted centroids (OpenCV), measured on such images beforehand."""
 WRONG_PX = 2.0
-"""A dot reported farther than this from where it is has another's id."""
+"""A dot reported farther than this from its true position has a wrong id."""
 TRACKED_DOTS = 4
 
 
@@ -306,8 +306,10 @@ def robustness(
     progress: ProgressCall,
     rows: dict[str, Conditions] = TESTED,
 ) -> list[dict[str, Any]]:
-    """A row for each of the conditions, by acquisition (no prior) and by tracking (a prior some 1 px off), of as many
-    random pictures; a face counts as found with four right dots or more, a frame with all its faces.
+    """A row for each of the conditions, by acquisition (no prior) and by tracking (a prior some 1 px off).
+
+    Each uses the same number of random images. A face counts as found with four correct dots or more, a frame with all
+    its faces.
     """
     table = []
     for at, (name, conditions) in enumerate(rows.items()):
@@ -338,12 +340,12 @@ SIDE_PX, TILT_DEG = 80.0, 50.0
 
 WALL, TAG_WHITE, TAG_BLACK, BLUR_PX, TAG_NOISE = 110.0, 215.0, 30.0, 0.7, 2.0
 PRIOR_PX = 0.7
-"""Standard deviation of the prior, and by how much it is off."""
+"""Standard deviation of the prior, and its offset."""
 TAG_IMAGES = 4
 
 
 def _tag_view(rng: np.random.Generator, at: FloatArray) -> FloatArray:
-    """Homography from a tag's unit square to pixels: 1 m from a camera of 1000 px, tilted and turned at random."""
+    """Homography from a tag's unit square to pixels: 1 m from a camera of 1000 px, tilted and rotated at random."""
     tilt, azimuth, roll = np.radians(rng.uniform(0, TILT_DEG)), *rng.uniform(0, 2 * np.pi, 2)
     axis = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     R = cv2.Rodrigues(axis * tilt)[0] @ cv2.Rodrigues(np.array([0.0, 0.0, roll]))[0]
@@ -353,7 +355,7 @@ def _tag_view(rng: np.random.Generator, at: FloatArray) -> FloatArray:
 
 
 def tag_picture(rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
-    """A picture of 640x480 of tags 0 to 11, and their corners (48, 2) [px]."""
+    """An image of 640x480 of tags 0 to 11, and their corners (48, 2) [px]."""
     image, corners = tag_scene(rng)
     image = image + rng.normal(0.0, TAG_NOISE, image.shape)
     return np.clip(np.rint(image), 0, 255).astype(np.uint8), corners
@@ -415,18 +417,18 @@ def tags(repetitions: int, seed: int) -> dict[str, Any]:
     }
 
 
-# -- how long it takes -----------------------------------------------------------------------------------------
+# -- duration --------------------------------------------------------------------------------------------------
 
 IMAGES = 8
-"""Pictures that the repetitions take in turn."""
+"""Number of images, used in turn."""
 FOUR = (0, 1, 2, 3)
-"""The corners of the first face: what is tracked where two cameras see four dots each."""
+"""The corners of the first face: tracked dots when two cameras see four dots each."""
 OFF_PX = (0.4, -0.3)
-"""How far their prior is off: four dots are checked against it, so that it is off evenly."""
+"""Offset of their prior, equal for all four, since they are checked against it."""
 
 
 class Pictures(NamedTuple):
-    """A detector and what it looks at: frames, priors of all their dots, priors of four."""
+    """A detector and its inputs: frames, priors of all their dots, priors of four."""
 
     detector: DotDetector
     frames: list[Frame]
@@ -434,25 +436,25 @@ class Pictures(NamedTuple):
     fours: list[Prior]
 
     def cold(self, k: int) -> CameraObservation:
-        """Picture ``k``, counted round, without a prior."""
+        """Detect in image ``k`` (cyclic) without a prior."""
         return self.detector.detect(self.frames[k % IMAGES], None)
 
     def track(self, k: int) -> CameraObservation:
-        """Picture ``k`` with a prior of all its dots."""
+        """Detect in image ``k`` with a prior of all its dots."""
         return self.detector.detect(self.frames[k % IMAGES], self.priors[k % IMAGES])
 
     def track_two(self, k: int) -> list[CameraObservation]:
-        """Pictures ``k`` and ``k`` + 1 with priors of four dots."""
+        """Detect in images ``k`` and ``k`` + 1 with priors of four dots."""
         return [self.detector.detect(self.frames[i % IMAGES], self.fours[i % IMAGES]) for i in (k, k + 1)]
 
     def label(self, k: int) -> int:
-        """OpenCV's number of components of picture ``k``: the baseline."""
+        """OpenCV's number of components of image ``k``: the baseline."""
         _, binary = cv2.threshold(self.frames[k % IMAGES].image, 0, 255, cv2.THRESH_BINARY | cv2.THRESH_OTSU)
         return int(cv2.connectedComponents(binary)[0])
 
 
 def pictures(seed: int, progress: ProgressCall) -> Pictures:
-    """IMAGES pictures of the demo's cell."""
+    """IMAGES images of the demo's cell."""
     rng = np.random.default_rng(seed)
     cell = demo_cell()
     camera = cell.rig.cameras[0]
@@ -476,7 +478,7 @@ def run_features(repetitions: int, seed: int, progress: ProgressCall) -> dict[st
     """Milliseconds per image of 640x480: search without a prior, windows at a prior of 14 dots, two images at priors of
     four, one labelling pass.
 
-    And what is found how well, in four pictures a repetition of each of the conditions of ``robustness``; and
+    Also the detection rate and accuracy in four images a repetition for each of the conditions of ``robustness``; and
     twelve tags.
     """
     shown = pictures(seed, progress)

@@ -1,11 +1,10 @@
-"""Benches of a live daemon, a cell like the demonstration's as processes.
+"""Benches of a live daemon, whose cell is like the demonstration's, in separate processes.
 
-``bench loop``: when the servo loop wakes and how long it works, beside an empty loop of the same period and priority in
-interleaved segments of the same run. ``bench idle``: what the processes take of the computer that is enabled and has
-nothing to do. ``bench page``: what pages of ``stereoservo web`` cost the servo loop, and how old the pictures are that
-they get; the pages are programs that read all that a page is sent; a browser draws it as well, on its own computer.
-``bench watch``: what ``stereoservo watch`` takes of a core for Foxglove and for Rerun, and whether the servo process
-notices it.
+``bench loop``: wake-up lateness and work of the servo loop, beside an empty loop of the same period and priority in
+interleaved segments of the same run. ``bench idle``: the processes' load on the computer when the cell is enabled and
+idle. ``bench page``: effect of pages of ``stereoservo web`` on the servo loop, and age of the images that they receive.
+The pages are programs that read all data sent to a page; a browser also draws it, on its own computer.
+``bench watch``: CPU use of ``stereoservo watch`` for Foxglove and for Rerun, and its effect on the servo process.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ PRIORITIES = {"fifo": 80, "ordinary": 0}
 LOADS = {"vision": (), "vision, zenoh flood, fit": ("flood", "fit")}
 SEGMENT_S = 2.0
 CYCLES = 1 << 20
-"""For which a log has room."""
+"""Number of cycles that a log holds."""
 PARK = "park"
 EMPTY = """
 import sys
@@ -61,7 +60,7 @@ pacing = clock_pacing(period_ns)
 for _ in range(cycles):
     pacing.wait()
 """
-"""A loop that does nothing, by the same code."""
+"""Program of an empty loop, by the same code."""
 FLOOD = """
 import os, sys
 from stereoservo.client import Client
@@ -70,7 +69,7 @@ with Client(sys.argv[1], operator="mallory") as client:
     while True:
         client.session.put(client.keys.command("jog", "mallory"), b"{")
 """
-"""Requests that the gateway has to refuse, as fast as they go."""
+"""Program that sends requests, which the gateway has to refuse, as fast as possible."""
 FIT = """
 import os
 os.nice(10)
@@ -81,12 +80,15 @@ BESIDE = {"flood": FLOOD, "fit": FIT}
 
 
 def run_loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``rows``: for each rate, scheduler and load, ``live`` (the servo loop of the demonstration's cell, which goes to
-    a goal in the images and away from it) and ``empty`` (a loop that does nothing, beside the daemon in every other
-    segment): quantiles of lateness and work [us], cycles, overruns and lost slots; ``excess_overruns``, the share of
-    cycles that overran, less the empty loop's. ``scheduler``: what the daemon got, not what it asked for.
+    """``rows``: quantiles of lateness and work [us], cycles, overruns and lost slots, for each rate, scheduler and
+    load.
 
-    Raises ExperimentError where the daemon does not come up.
+    ``live`` is the servo loop of the demonstration's cell, which moves to a goal in the images and back; ``empty`` is a
+    loop that does nothing, beside the daemon in every other segment. ``excess_overruns``: the share of cycles that
+    overran,
+    minus the empty loop's. ``scheduler``: the one that the daemon obtained, not the requested one.
+
+    Raises ExperimentError if the daemon does not start.
     """
     rows: list[dict[str, Any]] = []
     total = len(RATES_HZ) * len(PRIORITIES)
@@ -117,7 +119,7 @@ def running_cell(folder: Path, text: str, seed: int, environ: dict[str, str]) ->
     """The daemon of a cell file like the demonstration's, with an exact model and all kernels; ``environ``: for its
     processes.
 
-    Raises ExperimentError where it does not come up.
+    Raises ExperimentError if it does not start.
     """
     path = folder / "cell.toml"
     path.write_text(text, encoding="utf-8")
@@ -135,9 +137,9 @@ def running_cell(folder: Path, text: str, seed: int, environ: dict[str, str]) ->
 
 @contextmanager
 def moving_cell(folder: Path, rate_hz: int, priority: int, seed: int) -> Iterator[MovingCell]:
-    """The demonstration's cell as processes, whose arm goes to a goal in the images and away from it.
+    """The demonstration's cell in separate processes, whose arm moves to a goal in the images and back.
 
-    Raises ExperimentError where the daemon does not come up.
+    Raises ExperimentError if the daemon does not start.
     """
     text = shipped_cell_path("demo").read_text(encoding="utf-8")
     text = text.replace("rate_hz = 250.0", f"rate_hz = {rate_hz}.0\npriority = {priority}")
@@ -151,7 +153,7 @@ def moving_cell(folder: Path, rate_hz: int, priority: int, seed: int) -> Iterato
 
 
 def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetitions: int) -> dict[str, Any]:
-    """Figures of both loops in segments that alternate, and the share of the processors that the host took."""
+    """Figures of both loops in alternating segments, and the share of the processors that the host took."""
     live, empty = [], []
     before = stolen_ticks()
     for _ in range(repetitions):
@@ -177,13 +179,13 @@ def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetit
 
 
 def new_log(path: Path) -> Path:
-    """A log of cycles without any; real zeros, so that no cycle waits for the file system."""
+    """An empty log of cycles; real zeros, so that no cycle waits for the file system."""
     path.write_bytes(bytes((CYCLES + 1) * CYCLE_BYTES))
     return path
 
 
 def cycles_of(path: Path) -> IntArray:
-    """The cycles (k, 4) of a log: when they woke, how late, the work before [ns], slots skipped; not the first one."""
+    """The cycles (k, 4) of a log: wake-up time, lateness, previous work [ns], slots skipped; without the first."""
     rows = np.fromfile(path, dtype=np.int64).reshape(-1, CYCLE_BYTES // 8)
     return np.array(rows[2 : rows[0, 0] + 1])
 
@@ -207,7 +209,7 @@ def _quantiles(samples: IntArray) -> dict[str, float]:
 
 
 class MovingCell(NamedTuple):
-    """A running cell: the log of its loop's cycles, the scheduler that it got, and its motion."""
+    """A running cell: the log of its loop's cycles, the scheduler that it obtained, and its motion."""
 
     cycles: Path
     scheduler: str
@@ -215,9 +217,9 @@ class MovingCell(NamedTuple):
 
 
 class _Motion:
-    """An arm that goes to a goal in the images and away from it until it is told to end.
+    """An arm that moves to a goal in the images and back until it is told to end.
 
-    ``interruptions``: goals that did not end as they should, since the machine stalled.
+    ``interruptions``: goals that did not end normally, since the machine stalled.
     """
 
     def __init__(self) -> None:
@@ -225,7 +227,7 @@ class _Motion:
         self.ends = threading.Event()
 
     def run(self) -> None:
-        """Go to and fro."""
+        """Move back and forth."""
         with Client("demo", operator="bench") as client:
             start = client.status().joints
             away = {name: value + 0.12 for name, value in start.items() if name in ("j1", "j4")}
@@ -257,7 +259,7 @@ def _moving() -> Iterator[_Motion]:
 
 @contextmanager
 def _running(names: tuple[str, ...]) -> Iterator[None]:
-    """Other work, in processes of its own."""
+    """Context manager: other load, in separate processes."""
     started = [
         subprocess.Popen([sys.executable, "-c", BESIDE[name], "demo"], stdout=subprocess.DEVNULL) for name in names
     ]
@@ -279,17 +281,17 @@ OF_RENDERED_CAMERAS = re.compile(r"^(detector|noise|blur|background) = .*\n", re
 
 
 class Spent(NamedTuple):
-    """Of all threads of a process since its start: time on a processor [ns], and how often one was given to it."""
+    """All threads of a process since its start: CPU time [ns], and number of times one was scheduled."""
 
     processor_ns: int
     runs: int
 
 
 def run_idle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``processes``: of each process of the demonstration's cell with fake cameras, which render nothing, but its
-    supervisor, ``core_percent``, ``runs_per_s`` and ``resident_mb``, medians of segments; ``core_percent`` of all.
+    """``processes``: ``core_percent``, ``runs_per_s`` and ``resident_mb`` of each process of the demonstration's cell,
+    except its supervisor, with fake cameras, which render nothing; medians of segments. ``core_percent``: of all.
 
-    Raises ExperimentError where the daemon does not come up.
+    Raises ExperimentError if the daemon does not start.
     """
     segments: list[dict[str, tuple[float, float]]] = []
     with tempfile.TemporaryDirectory(prefix="ssidle") as scratch:
@@ -326,7 +328,7 @@ def _cell_text() -> str:
 
 
 def _segment(processes: dict[str, int]) -> dict[str, tuple[float, float]]:
-    """Per cent of a core and runs a second, by process."""
+    """Per cent of a core and number of runs per second, by process."""
     began_s, before = time.monotonic(), {name: spent_by(number) for name, number in processes.items()}
     time.sleep(IDLE_SEGMENT_S)
     took_s, after = time.monotonic() - began_s, {name: spent_by(number) for name, number in processes.items()}
@@ -345,7 +347,7 @@ def processor_share(before: Spent, after: Spent, took_s: float) -> float:
 
 
 def spent_by(process: int) -> Spent:
-    """What a process has taken since its start."""
+    """CPU time and number of runs of a process since its start."""
     threads = [path.read_text().split() for path in Path(f"/proc/{process}/task").glob("*/schedstat")]
     return Spent(sum(int(thread[0]) for thread in threads), sum(int(thread[2]) for thread in threads))
 
@@ -359,15 +361,17 @@ def _resident_mib(process: int) -> float:
 RATE_HZ, PRIORITY = 250, 80
 PAGES = 3
 PAGE_SETTLE_S = 1.5
-"""After pages have opened or closed: for so long a camera still encodes what was asked for."""
+"""Settling time after pages have opened or closed, in which a camera still encodes the former requests."""
 RESAMPLES = 2000
 INTERVAL = (2.5, 97.5)
 
 
 def run_page(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``pages`` and ``none``: lateness of the loop [us], quantiles of all segments of a kind, in pairs of drawn order;
+    """Lateness of the loop with pages (``pages``) and without (``none``) [us]: quantiles of all segments of a kind, in
+    pairs of random order.
+
     ``ratio``: of pages to none, with intervals of 95 % from a bootstrap over pairs; ``first_picture_s``: from the start
-    of ``stereoservo web`` to a page's first picture; ``picture_ms``: from the shutter to the page.
+    of ``stereoservo web`` to a page's first image; ``picture_ms``: from the shutter to the page.
 
     Raises ExperimentError.
     """
@@ -412,7 +416,7 @@ def _in_pairs(
     progress: ProgressCall,
 ) -> dict[str, Any]:
     """Lateness of the loop in segments with something ``beside(pair, there)`` it and without, by name, in pairs of
-    drawn order.
+    random order.
     """
     draws = np.random.default_rng(seed)
     late: dict[bool, list[IntArray]] = {True: [], False: []}
@@ -449,7 +453,7 @@ def quantiles(segments: list[IntArray]) -> dict[str, float | int]:
 
 
 def ratios(pages: list[IntArray], none: list[IntArray], draws: np.random.Generator) -> dict[str, Any]:
-    """Ratios of the quantiles with pages to those without, and their intervals: whole pairs are drawn again."""
+    """Ratios of the quantiles with pages to those without, and their intervals: whole pairs are resampled."""
     resampled = []
     for _ in range(RESAMPLES):
         chosen = draws.integers(len(pages), size=len(pages))
@@ -468,7 +472,7 @@ def ratios(pages: list[IntArray], none: list[IntArray], draws: np.random.Generat
 
 @contextmanager
 def _served() -> Iterator[str]:
-    """``stereoservo web`` as a process; gives the address of its WebSocket."""
+    """``stereoservo web`` as a process; yields the address of its WebSocket."""
     command = [sys.executable, "-m", "stereoservo.cli.main", "web", "demo", "--port", "0", "--json"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
@@ -483,7 +487,7 @@ def _served() -> Iterator[str]:
 
 @contextmanager
 def _reading(sockets: Any, url: str, count: int, ages: list[float]) -> Iterator[None]:
-    """``count`` open pages; the ages [ms] at which their pictures come are added to ``ages``."""
+    """``count`` open pages; the ages [ms] of their images on arrival are added to ``ages``."""
     with ExitStack() as ending:
         pages = [ending.enter_context(sockets.connect(url)) for _ in range(count)]
         threads = [threading.Thread(target=_read, args=(page, ages), daemon=True) for page in pages]
@@ -505,15 +509,17 @@ def _read(page: Any, ages: list[float]) -> None:
 # -- viewers ---------------------------------------------------------------------------------------------------
 
 WATCH_SETTLE_S = 4.0
-"""After a start: until its libraries are loaded and it shows the cell."""
+"""Settling time after a start, until its libraries are loaded and it shows the cell."""
 PROTOCOL = "foxglove.sdk.v1"
 
 
 def run_watch(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``watchers``: `watch` that prints a line a second, `watch --foxglove` with a program connected that reads every
-    topic, and `watch --rerun --save`: per cent of a core, medians of segments. ``servo_percent``: of the servo process,
-    with all three beside it and without.
-    ``watched``, ``none``: lateness of the loop; ``ratio``: as `bench page` has it.
+    """``watchers``: per cent of a core, medians of segments, of `watch` that prints a line a second, of
+    `watch --foxglove` with a program connected that reads every topic, and of `watch --rerun --save`.
+
+    ``servo_percent``: of the servo process, with all three beside it and without. ``watched``, ``none``: lateness of
+    the
+    loop; ``ratio``: as in `bench page`.
 
     Raises ExperimentError.
     """
@@ -590,7 +596,7 @@ def _end_viewer(process: subprocess.Popen[str]) -> None:
 
 
 def _read_all(viewer: Any) -> None:
-    """Subscribe to every topic that is offered, and read what comes, until the server ends."""
+    """Subscribe to every offered topic, and read all messages, until the server ends."""
     from websockets.exceptions import ConnectionClosed
 
     while True:

@@ -1,8 +1,9 @@
-"""``bench detectors``: what detectors find on photographs, how well, how fast, beside OpenCV's and pupil-apriltags.
+"""``bench detectors``: detection rate, accuracy and speed of detectors on photographs, beside OpenCV's and
+pupil-apriltags.
 
-The photographs lie on this computer: the Franka set, OpenCV's samples, tags that another program rendered. Of the
-product's faces of dots no photograph is to be had, so they are drawn into photographs, and lit and blurred as these
-are; beside ``cv2.findCirclesGrid`` on a grid of as large dots in the same places.
+The photographs are on this computer: the Franka set, OpenCV's samples, tags rendered by another program. There is no
+photograph of the product's faces of dots, so they are drawn into photographs, with the light and blur of these; beside
+``cv2.findCirclesGrid`` on a grid of equally large dots in the same places.
 """
 
 from __future__ import annotations
@@ -36,20 +37,20 @@ from stereoservo_sim.experiments.textured import context_of
 from stereoservo_sim.progress import ProgressCall
 
 DEBIAN = Path("/usr/share/doc/opencv-doc")
-"""Where Debian's package opencv-doc puts its files."""
+"""Directory of the files of Debian's package opencv-doc."""
 T = TypeVar("T")
 BOARDS = "[lr][ei][fg]*t[0-9][0-9].jpg"
 """OpenCV's chessboard pairs, among its samples."""
 LEAST = 200
-"""Rows and columns of a photograph at least: smaller ones are icons."""
+"""Least number of rows and columns of a photograph: smaller ones are icons."""
 
 
 @dataclass(frozen=True)
 class Photographs:
-    """Paths of pictures by what they show; empty where they are not here, with the reason in ``missing``.
+    """Paths of images by their content; empty if they are not available, with the reason in ``missing``.
 
     ``franka``: ``pose##_cam#.jpg``; ``boards``: chessboards of 9x6 inner corners; ``sheet``: six tags of 6x6_250 on one
-    sheet; ``webots``: tags of 36h11 that Webots rendered; ``others``: no tag, no chessboard, no plate.
+    sheet; ``webots``: tags of 36h11 rendered by Webots; ``others``: no tag, no chessboard, no plate.
     """
 
     franka: tuple[Path, ...]
@@ -61,9 +62,9 @@ class Photographs:
 
 
 def photographs(root: Path | None = None) -> Photographs:
-    """Those below ``root`` (default: ``$STEREOSERVO_DATA``, else ``../shared/data``) and of Debian's opencv-doc.
+    """Photographs below ``root`` (default: ``$STEREOSERVO_DATA``, else ``../shared/data``) and of Debian's opencv-doc.
 
-    Below ``root``: ``fairo_franka/set_a``, ``opencv-doc`` (as the package has it), ``april_vision`` (``test_data`` of
+    Below ``root``: ``fairo_franka/set_a``, ``opencv-doc`` (as in the package), ``april_vision`` (``test_data`` of
     the source distribution).
     """
     root = Path(os.environ.get("STEREOSERVO_DATA", "../shared/data")) if root is None else root
@@ -94,7 +95,7 @@ def _large(path: Path) -> bool:
 
 
 def read(path: Path) -> ImageArray:
-    """A picture in grey. Raises OSError where it does not decode."""
+    """An image in grey. Raises OSError if it cannot be decoded."""
     image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise OSError(f"{path} is no picture that OpenCV decodes")
@@ -103,8 +104,12 @@ def read(path: Path) -> ImageArray:
 
 @dataclass
 class Row:
-    """What ``detector`` found ``on`` some ``pictures``: ``found`` right ones of ``shown``, ``false`` ones, how far off
-    (``rms_px``, by the measure that ``accuracy`` names), and the processor's time for a picture."""
+    """Result of ``detector`` ``on`` a number of ``pictures``.
+
+    ``found``: correct ones of ``shown``; ``false``: false ones; ``rms_px``: error, by the measure that ``accuracy``
+    names;
+    and the CPU time per image.
+    """
 
     on: str
     pictures: int
@@ -122,12 +127,12 @@ class Row:
 
 
 def look(detector: Detector, image: ImageArray) -> CameraObservation:
-    """What ``detector`` sees in ``image`` without a prior."""
+    """Observation of ``detector`` in ``image`` without a prior."""
     return detector.detect(Frame("photograph", 0, 1_000_000_000, 1_000_000_000, image), None)
 
 
 def over(images: Sequence[ImageArray], call: Callable[[ImageArray], T], repetitions: int) -> tuple[list[T], float]:
-    """``call`` of each image, and the median of its processor time [ms] over ``repetitions`` of each."""
+    """``call`` of each image, and the median of its CPU time [ms] over ``repetitions`` of each."""
     found, times = [], []
     call(images[0])
     for image in images:
@@ -145,10 +150,10 @@ COLUMNS, ROWS = 9, 6
 FLAGS = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
 Board = FloatArray | None
 BOARD_WRONG_PX = 3.0
-"""A chessboard of which a corner is farther than this from where most detectors have it is a false one."""
+"""A chessboard is false if a corner is farther than this from its position by most detectors."""
 CORNERS, APART_PX = 150, 12
 CLOSE_PX, FALSE_PX = 1.0, 1.5
-"""A corner of table or wall is found within the first of its place; beyond the second it is false."""
+"""A corner of table or wall is found within the first distance of its position; beyond the second it is false."""
 PATCH = 10
 """Half the side of a corner's patch and of OpenCV's window [px]."""
 
@@ -175,8 +180,9 @@ METHODS: dict[str, Callable[[ImageArray], Board]] = {
 
 
 def board_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
-    """Chessboards; accuracy: what a camera with k1, k2, p1, p2, calibrated with the same corners, leaves, an axis. Only
-    boards that all detectors found enter it."""
+    """Chessboards; accuracy: residual per axis of a camera with k1, k2, p1, p2, calibrated with the same corners, on
+    boards that all detectors found.
+    """
     images = [read(path) for path in paths]
     timed = {name: over(images, find, repetitions) for name, find in METHODS.items()}
     by_picture = [_in_order({name: each[k] for name, (each, _) in timed.items()}) for k in range(len(images))]
@@ -202,7 +208,7 @@ def board_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
 
 
 def _in_order(boards: dict[str, Board]) -> dict[str, Board]:
-    """Boards (54, 2) of one picture counted from the same end: that of the first that was found."""
+    """Boards (54, 2) of one image counted from the same end: that of the first that was found."""
     first = next((board for board in boards.values() if board is not None), None)
     return {
         name: board
@@ -213,7 +219,7 @@ def _in_order(boards: dict[str, Board]) -> dict[str, Board]:
 
 
 def calibrated_rms(boards: Sequence[tuple[str, Board]], shape: tuple[int, ...]) -> float:
-    """Rms [px], an axis, that ``cv2.calibrateCamera`` leaves of ``boards``, each of a camera."""
+    """Rms residual [px] per axis of ``cv2.calibrateCamera`` on ``boards``, each of a camera."""
     layout = np.zeros((COLUMNS * ROWS, 3), np.float32)
     layout[:, :2] = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), axis=-1).reshape(-1, 2)
     squares, count = 0.0, 0
@@ -239,8 +245,11 @@ def boardless_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
 
 
 def corner_rows(paths: Sequence[Path], repetitions: int) -> list[Row]:
-    """Natural corners of the Franka's room, which stand still while the arm, its shadow and the exposure change: from
-    each camera's median picture to each of its pictures. Found: within ``CLOSE_PX`` of where it stands."""
+    """Natural corners of the Franka's room, which are static while the arm, its shadow and the exposure change.
+
+    They are tracked from each camera's median image to each of its images. Found: within ``CLOSE_PX`` of their
+    position.
+    """
     shown, seen = 0, {name: [0, 0, 0.0, 0] for name in ("corners (stereoservo)", "cv2.calcOpticalFlowPyrLK")}
     times: dict[str, list[float]] = {name: [] for name in seen}
     for camera in sorted({path.stem[-1] for path in paths}):
@@ -316,9 +325,9 @@ GRID = 4
 """Dots along a side of the peer's grid."""
 BLUR_PX, NOISE = 0.7, 2.0
 LIGHT_PX = 40.0
-"""How smooth the photograph's light is that falls on the plate [px]."""
+"""Smoothness of the photograph's light on the plate [px]."""
 DARKEST = 0.35
-"""The least light on a plate, of the full one."""
+"""Least light on a plate, as a share of the full light."""
 DISTANCE, TILT_DEG = (0.8, 1.4), 50.0
 WRONG_PX = 2.0
 
@@ -329,7 +338,7 @@ def _grid() -> FloatArray:
 
 
 def drawn(photograph: ImageArray, dots: FloatArray, rng: np.random.Generator) -> tuple[ImageArray, FloatArray]:
-    """A photograph with a plate of ``dots`` (n, 2) [m] in it, and their centres (n, 2) [px]."""
+    """A photograph with a plate of ``dots`` (n, 2) [m] drawn into it, and their centres (n, 2) [px]."""
     image = cv2.resize(photograph, SIZE, interpolation=cv2.INTER_AREA).astype(np.float32)
     light = cv2.GaussianBlur(image, (0, 0), LIGHT_PX)
     light = np.maximum(light / light.max(), DARKEST)
@@ -394,7 +403,7 @@ def dot_rows(paths: Sequence[Path], repetitions: int, seed: int) -> list[Row]:
 
 
 def _errors(places: FloatArray, truth: FloatArray, name: str) -> FloatArray:
-    """Errors (n, 2) [px], NaN where nothing was found; a grid may be counted from any of its corners."""
+    """Errors (n, 2) [px], NaN if nothing was found; a grid may be counted from any of its corners."""
     if name.startswith("dots"):
         return places - truth
     turned = truth.reshape(GRID, GRID, 2)
@@ -414,22 +423,22 @@ Find = tuple[int, FloatArray]
 """A tag's id and its corners (4, 2) [px], clockwise."""
 Finder = Callable[[ImageArray], list[Find]]
 FRANKA: dict[int, frozenset[int]] = {0: frozenset((0, 2, 3)), 1: frozenset((0, 2)), 2: frozenset((0, 2, 3))}
-"""Tags that lie on the Franka's table, in each camera whole; the hand has tag 9."""
+"""Tags on the Franka's table that are entirely in the image, by camera; the hand has tag 9."""
 HAND = 9
 SHEET = frozenset((23, 40, 62, 98, 124, 203))
-"""Tags on OpenCV's sheet, as its documentation tells."""
+"""Tags on OpenCV's sheet, according to its documentation."""
 WEBOTS = 14
 """The tag in all of april-vision's test pictures."""
 WRONG_BITS = 1
-"""Cells that may read wrongly by the plain threshold that judges a find."""
+"""Number of cells that may be misread by the plain threshold that judges a find."""
 AT_PX = 3.0
-"""How far from its place a tag that stands still may be found."""
+"""Largest distance of a static tag from its position."""
 PUPIL_OFFSET = 0.5
-"""What pupil-apriltags adds to each coordinate: the centres of its pixels lie at halves."""
+"""Offset of pupil-apriltags' coordinates, whose pixel centres are at halves."""
 
 
 def finders(name: DictionaryName) -> tuple[dict[str, Finder], list[str]]:
-    """Detectors of a dictionary's tags, and why one is left out."""
+    """Detectors of a dictionary's tags, and the reason why one is omitted."""
     options = {"tags": list(range(size_of(name))), "dictionary": name}
     of_size: dict[tuple[int, ...], TagDetector] = {}
 
@@ -475,7 +484,7 @@ def _opencv(name: DictionaryName, refinement: int) -> Finder:
 
 
 def _pupil(name: DictionaryName) -> Finder:
-    module = import_module("pupil_apriltags")  # only where it is installed
+    module = import_module("pupil_apriltags")  # only if it is installed
     detector = module.Detector(f"tag{name}", nthreads=1, quad_decimate=1.0)
 
     def find(image: ImageArray) -> list[Find]:
@@ -488,7 +497,9 @@ def _pupil(name: DictionaryName) -> Finder:
 
 
 def reads(image: ImageArray, corners: FloatArray, cells: FloatArray) -> bool:
-    """Whether a plain threshold at the middle of each cell of ``cells`` (n, n) reads them, in any of the four turns."""
+    """Whether a plain threshold at the middle of each cell of ``cells`` (n, n) reads them, in any of the four
+    rotations.
+    """
     n = len(cells)
     square = np.array([[0, 0], [n, 0], [n, n], [0, n]], dtype=np.float32)
     H = cv2.getPerspectiveTransform(corners.astype(np.float32), square)
@@ -507,11 +518,11 @@ def judged(
     allowed: Sequence[frozenset[int]],
     places: Sequence[dict[int, FloatArray]],
 ) -> tuple[dict[str, list[dict[int, FloatArray]]], dict[str, int], int]:
-    """The right finds of each detector and picture, the number of its false ones, and how many tags are shown: those
-    that any detector found rightly.
+    """The correct finds of each detector and image, the number of its false ones, and the number of shown tags: those
+    that any detector found correctly.
 
-    A find is right where its id is one of those ``allowed`` in the picture, its cells read as its code, and it is near
-    its place, where ``places`` has one.
+    A find is correct if its id is one of those ``allowed`` in the image, its cells read as its code, and it is near
+    its position, if ``places`` has one.
     """
     right: dict[str, list[dict[int, FloatArray]]] = {detector: [] for detector in finds}
     false = dict.fromkeys(finds, 0)
@@ -535,13 +546,14 @@ def judged(
 
 
 def _apart(one: FloatArray, other: FloatArray) -> float:
-    """Distance [px] of two quadrilaterals' corners, the largest, by the turn that makes it least."""
+    """Largest distance [px] of two quadrilaterals' corners, for the rotation that minimises it."""
     return min(float(np.hypot(*(np.roll(one, k, axis=0) - other).T).max()) for k in range(4))
 
 
 def franka_rows(paths: Sequence[Path], repetitions: int) -> tuple[list[Row], list[str]]:
-    """Tags on the Franka photographs. Accuracy: corners of the table's tags in one camera carried to another by the
-    best homography."""
+    """Tags on the Franka photographs. Accuracy: corners of the table's tags transferred from one camera to another by
+    the best homography.
+    """
     images = [read(path) for path in paths]
     cameras = [int(path.stem[-1]) for path in paths]
     poses = [path.stem[:6] for path in paths]
@@ -569,7 +581,7 @@ def franka_rows(paths: Sequence[Path], repetitions: int) -> tuple[list[Row], lis
 
 
 def _standing(finds: dict[str, list[list[Find]]], cameras: Sequence[int], camera: int) -> dict[int, FloatArray]:
-    """Median corners of each of the table's tags in a camera, of all detectors and pictures."""
+    """Median corners of each of the table's tags in a camera, of all detectors and images."""
     seen: dict[int, list[FloatArray]] = {}
     for each in finds.values():
         for k, of in enumerate(cameras):
@@ -580,7 +592,7 @@ def _standing(finds: dict[str, list[list[Find]]], cameras: Sequence[int], camera
 
 
 def _transfer(one: dict[int, FloatArray], other: dict[int, FloatArray]) -> tuple[float, int]:
-    """Squares [px²] of what a homography leaves of the table's corners in two pictures, and its freedoms."""
+    """Squared residuals [px²] of a homography of the table's corners in two images, and its degrees of freedom."""
     tags = sorted((set(one) & set(other)) - {HAND})
     if len(tags) < 2:
         return 0.0, 0
@@ -591,8 +603,9 @@ def _transfer(one: dict[int, FloatArray], other: dict[int, FloatArray]) -> tuple
 
 
 def sheet_rows(paths: Sequence[Path], name: DictionaryName, on: str, repetitions: int) -> tuple[list[Row], list[str]]:
-    """Tags on a sheet (of which it is known which) or, where ``name`` is 36h11, those of Webots; accuracy of the latter
-    is not known."""
+    """Tags on a sheet (whose ids are known) or, if ``name`` is 36h11, those of Webots; accuracy of the latter is not
+    known.
+    """
     images = [read(path) for path in paths]
     methods, why = finders(name)
     timed = {detector: over(images, find, repetitions) for detector, find in methods.items()}
@@ -637,10 +650,10 @@ def tag_rows(shown: Photographs, repetitions: int) -> tuple[list[Row], list[str]
 
 
 def run_detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """A row for each detector and kind of pictures, and what was left out.
+    """A row for each detector and kind of images, and the omitted ones.
 
-    ``shown``: what any of the detectors found rightly; ``false``: what is not there, or has another's id. Raises
-    ExperimentError ``data_missing`` where there are no photographs at all.
+    ``shown``: found correctly by any of the detectors; ``false``: not present, or with a wrong id. Raises
+    ExperimentError ``data_missing`` if there are no photographs at all.
     """
     shown = photographs()
     if not (shown.franka or shown.boards or shown.others or shown.sheet or shown.webots):
@@ -657,7 +670,7 @@ def run_detectors(repetitions: int, seed: int, progress: ProgressCall) -> dict[s
 
 
 def show_detectors(answer: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Print the table, and below it what was left out; the rest of the answer."""
+    """Print the table, and below it the omitted rows; returns the rest of the answer."""
     table = Table("pictures", "n", "detector", "found", "of", "false", "rms [px]", "measured by", "CPU [ms]")
     last = ""
     for row in answer["rows"]:

@@ -1,5 +1,5 @@
-"""What recording costs: microseconds a cycle in the servo loop and a step in the gateway, and bytes a day of the
-demonstration's cell at rest and in motion, with a replay of what was written.
+"""Cost of recording: microseconds a cycle in the servo loop and a step in the gateway, and bytes a day of the
+demonstration's cell at rest and in motion, with a replay of the recording.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from stereoservo_sim.progress import ProgressCall
 PART_S, DAY_S = 15.0, 86_400.0
 JOG_S, JOG_SPEED = 0.2, 0.1
 ROUNDS, EVERY = 4, 15
-"""Rounds a repetition, over each so many-th step of a flight."""
+"""Rounds per repetition, and interval of the steps of a recording used in each."""
 Steps = list[tuple[StepInputs, StepOutputs]]
 
 
 def run_recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Cost and size of recording the steps of the demonstration's cell, rendered cameras and all."""
+    """Cost and size of recording the steps of the demonstration's cell, including rendered cameras."""
     with tempfile.TemporaryDirectory(prefix="ssrecord") as name:
         folder = Path(name)
         sizes: dict[str, Any] = {}
@@ -50,7 +50,7 @@ def run_recording(repetitions: int, seed: int, progress: ProgressCall) -> dict[s
 
 
 def _flown(path: Path, folder: Path, seed: int, *, moves: bool) -> tuple[Steps, dict[str, Any]]:
-    """The steps of some seconds of the cell, and what its recording takes, with what the replay says."""
+    """The steps of some seconds of the cell, the size of their recording, and the result of its replay."""
     log: Steps = []
     cell = load_cell_file(demo_cell_path())
     with LockstepCell(
@@ -84,7 +84,7 @@ def _flown(path: Path, folder: Path, seed: int, *, moves: bool) -> tuple[Steps, 
 
 
 def _former(inputs: StepInputs, outputs: StepOutputs) -> bytes:
-    """The record of a step as it was before it had a layout: the baseline."""
+    """A step's record in its former format without a layout: the baseline."""
     record = StepRecord(
         outputs.status.step, inputs, outputs.command, outputs.status.command_raw, zlib.crc32(encode(outputs))
     )
@@ -92,7 +92,7 @@ def _former(inputs: StepInputs, outputs: StepOutputs) -> bytes:
 
 
 def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
-    """Microseconds of CPU a step: in the loop by ring and, as before, by msgpack and a socket; in the gateway."""
+    """Microseconds of CPU per step: in the loop by ring and, as before, by msgpack and a socket; in the gateway."""
     ring = RingWriter(folder / "steps.ring")
     reader = RingReader(folder / "steps.ring")
     reader.attach()
@@ -109,7 +109,7 @@ def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
     ways = [("ring", by_ring), ("msgpack_and_socket", by_socket)]
     for _ in range(ROUNDS * repetitions):
         for inputs, outputs in log[::EVERY]:
-            ways.reverse()  # the first one of them finds the step's data cold
+            ways.reverse()  # the first method finds the step's data cold
             for name, way in ways:
                 at = time.perf_counter()
                 way(inputs, outputs)
@@ -130,7 +130,7 @@ def _costs(log: Steps, folder: Path, repetitions: int) -> dict[str, Any]:
 
 
 def _compression(log: Steps) -> float:
-    """Microseconds of CPU that compressing a step takes, in blocks as a recorder makes them."""
+    """Microseconds of CPU per step to compress it, in blocks as a recorder makes them."""
     records = [encode_step(inputs, outputs) for inputs, outputs in log]
     block = round(CHUNK_S * 1e9 / log[0][0].period_ns)
     blocks = StepBlocks()

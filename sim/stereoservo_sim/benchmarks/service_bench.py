@@ -1,7 +1,7 @@
-"""A daemon with emulated drives for fault trials of the whole service, and what can be done to it.
+"""A daemon with emulated drives for fault trials of the whole service, and the acts that inject faults.
 
-An act returns the time [ns] from which the arm's rest counts. What lasts for a trial (processes, sockets, files that
-are in the way) is in the bench's ``lasting`` stack.
+An act returns the time [ns] from which the arm's time to rest counts. Resources that last for a trial (processes,
+sockets, obstructing files) are in the bench's ``lasting`` stack.
 """
 
 from __future__ import annotations
@@ -47,24 +47,25 @@ from stereoservo_sim.world.simulated_cell import demo_cell
 T = TypeVar("T")
 CELL = "hil-can"
 RATE_HZ = 250.0
-"""Of its servo loop."""
+"""Rate of its servo loop."""
 SPEED_SCALE = 0.1
 END = 0.85
-"""[rad] Of the first joint to either side, at a tenth of its speed: the arm moves for longer than any trial lasts."""
+"""Goal of the first joint to either side [rad]: at a tenth of its speed the motion lasts longer than any trial."""
 READY_S = 60.0
 START_TRIES = 3
-"""Of a daemon that a loaded machine does not bring up in time."""
+"""Attempts to start a daemon, since a loaded machine may not start it in time."""
 WATCH = {"heartbeat_timeout_ms": "100", "rpdo_deadline_ms": "0"}
-"""The drives' own watch of their master as by default, 100 ms; the shipped cell is more patient."""
+"""The drives' monitoring of their master as by default, 100 ms; the shipped cell is more tolerant."""
 CAMERAS = '[[camera]]\nname = "{}"\ndriver = "fake"\nmount = "eye_to_hand"\n\n'
 LEAST_PRIORITY = 19
-"""Of a second daemon: whether it is let in is tried, not what its start costs the first one's loops."""
+"""Priority of a second daemon: whether it is refused is tested, not the effect of its start on the first one's loops.
+"""
 SOCKETS = 200
 PUTS = 20_000
 LITTLE_MEMORY = 64 << 20
-"""Bytes of address space, less than the gateway has."""
+"""Limit of the address space [bytes], less than the gateway uses."""
 BEGINS_S = 0.4
-"""From the first hostile socket or message to what is timed."""
+"""Time from the first hostile socket or message to the start of timing."""
 CONNECTS = """
 import os, socket, sys, time
 os.nice(19)
@@ -89,8 +90,10 @@ while True:
             held[k] = connected()
     time.sleep(0.02)
 """
-"""Keeps TCP sockets open on which it says nothing; one that the listener gives up is opened again. At least priority: a
-peer far away takes no time of this machine for its own program."""
+"""Keeps idle TCP sockets open, and reopens one that the listener closes. At least priority, since a remote peer takes
+no
+CPU time of this machine.
+"""
 PUTS_REFUSED = """
 import sys, time
 from stereoservo.client import Client
@@ -107,8 +110,8 @@ class VoidTrialError(Exception):
 
 
 def processes_of(runtime: Path) -> dict[str, int]:
-    """Live processes of a cell by what they are: ``servo``, ``gateway``, ``vision-CAMERA``, …; found by the runtime
-    directory on their command lines.
+    """Live processes of a cell by role: ``servo``, ``gateway``, ``vision-CAMERA``, …; found by the runtime directory on
+    their command lines.
     """
     found = {}
     for entry in Path("/proc").iterdir():
@@ -141,11 +144,11 @@ class ServiceBench:
     folder: Path
     lasting: ExitStack = field(default_factory=ExitStack)
     mounts: ExitStack = field(default_factory=ExitStack)
-    """Unmounts what the state directory lies on, once the daemon has ended."""
+    """Unmounts the file system of the state directory, once the daemon has ended."""
     goals: list[str] = field(default_factory=list)
-    """Of a trial; each must have one end."""
+    """Goals of a trial; each must have one end."""
     port: int = field(default_factory=_free_port)
-    """Of the daemon's TCP endpoint."""
+    """Port of the daemon's TCP endpoint."""
     emulator: EmulatorProcess = field(init=False)
     daemon: DaemonProcess = field(init=False)
     cell: Path = field(init=False)
@@ -153,7 +156,7 @@ class ServiceBench:
     starts: int = 0
 
     def __enter__(self) -> Self:
-        # What compiles beside the loop would be in its times.
+        # Compilation beside the loop would affect its times.
         subprocess.run([sys.executable, "-m", "stereoservo.cli.main", "warmup"], stdout=sys.stderr, check=True)
         text = shipped_cell_path(CELL).read_text(encoding="utf-8")
         text += "\n[recording]\nreserve_mib = 0\n"  # small disks are filled to the last byte
@@ -184,7 +187,7 @@ class ServiceBench:
             self.emulator.stop()
 
     def start(self) -> None:
-        """Start a daemon; the one before must have ended. Raises DaemonError."""
+        """Start a daemon; the previous one must have ended. Raises DaemonError."""
         for tries_left in reversed(range(START_TRIES)):
             self.starts += 1
             self.daemon = DaemonProcess(self.cell, log=self.folder / f"daemon-{self.starts}.log")
@@ -196,7 +199,7 @@ class ServiceBench:
                     raise
 
     def end_daemon(self) -> None:
-        """End the daemon, whatever became of its processes."""
+        """End the daemon, whatever the state of its processes."""
         for pid in self.processes().values():
             send(pid, signal.SIGCONT)
         self.daemon.stop()
@@ -208,7 +211,7 @@ class ServiceBench:
             time.sleep(0.05)
 
     def ready(self) -> None:
-        """A daemon that lives, without fault or stop, its drives on."""
+        """Restore a live daemon without fault or stop, its drives on."""
         for pid in self.processes().values():
             send(pid, signal.SIGCONT)
         if self.daemon.process.poll() is not None:
@@ -217,7 +220,7 @@ class ServiceBench:
         self.asked(_operated)
 
     def asked(self, ask: Callable[[Client], T]) -> T:
-        """The answer of a daemon whose gateway may be being started again. Raises ClientError, SessionError."""
+        """The answer of a daemon whose gateway may be restarting. Raises ClientError, SessionError."""
         until = time.monotonic() + READY_S
         while True:
             try:
@@ -229,7 +232,7 @@ class ServiceBench:
                 time.sleep(0.1)
 
     def asked_ready(self, ask: Callable[[Client], T]) -> T:
-        """The answer of a cell that is made ready first, and again where a stalled machine stopped it since."""
+        """The answer of a cell that is made ready first, again if a stalled machine stopped it since."""
 
         def operated(client: Client) -> T:
             _operated(client)
@@ -239,7 +242,7 @@ class ServiceBench:
         return self.asked(operated)
 
     def forget_state(self) -> None:
-        """Remove the models and taught goals that a trial left, and the disk they lie on."""
+        """Remove the models and taught goals of a trial, and the disk they are on."""
         self.mounts.close()
         for path in (*self.directories.models.glob("*"), *self.directories.state.glob("taught.json*")):
             path.unlink()
@@ -260,7 +263,7 @@ class ServiceBench:
         return found
 
     def await_process(self, name: str) -> None:
-        """Wait until a process of the daemon, which may be being started again, lives and gives a sign of it.
+        """Wait until a process of the daemon, which may be restarting, is alive and responds.
 
         Raises VoidTrialError.
         """
@@ -275,11 +278,11 @@ class ServiceBench:
                 time.sleep(0.01)
 
     def truth(self) -> TrueJointHistory:
-        """Where the emulated arm was; to be closed."""
+        """The emulated arm's true motion; to be closed."""
         return TrueJointHistory.open(self.directories.runtime / FILE_NAME)
 
     def status(self) -> tuple[int, dict[str, Any]]:
-        """What ``stereoservo status --json`` says, and its exit code."""
+        """The output of ``stereoservo status --json``, and its exit code."""
         done = subprocess.run(
             [sys.executable, "-m", "stereoservo.cli.main", "status", CELL, "--json"],
             capture_output=True,
@@ -291,9 +294,9 @@ class ServiceBench:
 
 @contextmanager
 def running_bench() -> Iterator[ServiceBench]:
-    """A running daemon whose directories, and those of clients that are started inside, are its own.
+    """A running daemon with its own directories, also those of clients that are started inside.
 
-    Raises ExperimentError for what a daemon or a client says.
+    Raises ExperimentError for errors of a daemon or a client.
     """
     with tempfile.TemporaryDirectory(prefix="ssbench") as name:
         folder = Path(name)
@@ -313,9 +316,9 @@ def running_daemon(
     environ: dict[str, str] | None = None,
     code: str = "daemon",
 ) -> Iterator[DaemonInfo]:
-    """The daemon of a cell file, which is up, with its directories in ``folder``; ``environ``: for its processes.
+    """The running daemon of a cell file, with its directories in ``folder``; ``environ``: for its processes.
 
-    Raises ExperimentError ``code`` for what a daemon or a client says.
+    Raises ExperimentError ``code`` for errors of a daemon or a client.
     """
     log = folder / "daemon.log"
     with environment(directories_in(folder)):
@@ -333,7 +336,7 @@ def directories_in(folder: Path) -> dict[str, str]:
 
 @contextmanager
 def environment(variables: dict[str, str]) -> Iterator[None]:
-    """Context manager: environment variables of this process and of those that it starts."""
+    """Context manager: environment variables of this process and of those it starts."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -353,7 +356,7 @@ def send(pid: int, how: signal.Signals) -> None:
 
 
 def _operated(client: Client) -> None:
-    """What an operator does to go on: reset, enable, resume, where it is needed."""
+    """An operator's actions to continue: reset, enable, resume, as needed."""
     if client.status().lifecycle == "fault":
         client.reset()
     if client.status().lifecycle != "active":
@@ -373,7 +376,7 @@ def _end(child: subprocess.Popen[bytes]) -> None:
 
 
 def raise_stop_slot(bench: ServiceBench) -> int:
-    """Raise the stop in shared memory."""
+    """Set the stop flag in shared memory."""
     slot = StopSlot(bench.directories.stop_slot)
     t0_ns = time.monotonic_ns()
     slot.raise_stop()
@@ -382,7 +385,7 @@ def raise_stop_slot(bench: ServiceBench) -> int:
 
 
 def stop_command(bench: ServiceBench) -> int:
-    """``stereoservo stop``, from its start."""
+    """Run ``stereoservo stop``; the time is its start."""
     t0_ns = time.monotonic_ns()
     command = [sys.executable, "-m", "stereoservo.cli.main", "stop", CELL]
     subprocess.run(command, capture_output=True, check=True)
@@ -390,13 +393,13 @@ def stop_command(bench: ServiceBench) -> int:
 
 
 def second_daemon(bench: ServiceBench) -> int:
-    """A second daemon of the cell; the time is when it has been refused."""
+    """Start a second daemon of the cell; the time is that of its refusal."""
     _refused(bench, bench.cell, {})
     return time.monotonic_ns()
 
 
 def second_daemon_elsewhere(bench: ServiceBench) -> int:
-    """A second daemon of the same drives whose directories and endpoints are others, likewise."""
+    """Start a second daemon of the same drives with other directories and endpoints; the time is its refusal."""
     folder = bench.folder / "other"
     folder.mkdir(exist_ok=True)
     cell = folder / bench.cell.name
@@ -407,7 +410,7 @@ def second_daemon_elsewhere(bench: ServiceBench) -> int:
 
 
 def _refused(bench: ServiceBench, cell: Path, environment: dict[str, str]) -> None:
-    """Start a daemon that must end by itself, for a lock. Raises ExperimentError, VoidTrialError."""
+    """Start a daemon that must end by itself because of a lock. Raises ExperimentError, VoidTrialError."""
     log = bench.folder / "second.log"
     with DaemonProcess(cell, log=log, environment=environment) as second:
         os.setpriority(os.PRIO_PROCESS, second.process.pid, LEAST_PRIORITY)
@@ -420,7 +423,7 @@ def _refused(bench: ServiceBench, cell: Path, environment: dict[str, str]) -> No
 
 
 def damaged(spoil: Callable[[CellDirectories], None]) -> Callable[[ServiceBench], int]:
-    """The gateway is killed, and what it left is damaged."""
+    """Kill the gateway, and damage its files."""
 
     def act(bench: ServiceBench) -> int:
         gateway = bench.processes()["gateway"]
@@ -434,12 +437,12 @@ def damaged(spoil: Callable[[CellDirectories], None]) -> Callable[[ServiceBench]
 
 
 def spoil_taught(directories: CellDirectories) -> None:
-    """``taught.json`` ends in the middle."""
+    """Truncate ``taught.json``."""
     directories.taught.write_bytes(b'{"goals": {"park": {"set_poi')
 
 
 def spoil_model(directories: CellDirectories) -> None:
-    """The newest of two models has a byte flipped."""
+    """Flip a byte of the newest of two models."""
     directories.models.mkdir(exist_ok=True)
     good = exact_simulated_model(demo_cell(), 0)
     (directories.models / f"model-{good.epoch:06d}.json").write_bytes(encode_model(good))
@@ -449,28 +452,28 @@ def spoil_model(directories: CellDirectories) -> None:
 
 
 def spoil_handled(directories: CellDirectories) -> None:
-    """The slot of the events that were handled is full of ones."""
+    """Fill the slot of the handled events with ones."""
     slot = directories.runtime / "handled.slot"
     with slot.open("r+b") as file:
         file.write(b"\xff" * slot.stat().st_size)
 
 
 def idle_sockets(bench: ServiceBench) -> int:
-    """TCP sockets that say nothing exhaust the listener."""
+    """Exhaust the listener with idle TCP sockets."""
     t0_ns = time.monotonic_ns()
     bench.start_lasting(CONNECTS, str(bench.port), str(SOCKETS))
     return t0_ns
 
 
 def refused_puts(bench: ServiceBench) -> int:
-    """A flood of commands that are none."""
+    """Flood with invalid commands."""
     t0_ns = time.monotonic_ns()
     bench.start_lasting(PUTS_REFUSED, CELL, str(PUTS))
     return t0_ns
 
 
 def during(first: Callable[[ServiceBench], int], then: Callable[[ServiceBench], int]) -> Callable[[ServiceBench], int]:
-    """An act while another lasts; the time is that of the second."""
+    """An act during another; the time is that of the second."""
 
     def act(bench: ServiceBench) -> int:
         first(bench)
@@ -481,7 +484,7 @@ def during(first: Callable[[ServiceBench], int], then: Callable[[ServiceBench], 
 
 
 def stop_by_open_session(bench: ServiceBench) -> int:
-    """A client that came by TCP before the listener was exhausted asks for the stop."""
+    """A client that connected by TCP before the listener was exhausted requests the stop."""
     with Client(CELL, endpoint=f"tcp/127.0.0.1:{bench.port}") as client:
         idle_sockets(bench)
         time.sleep(BEGINS_S)
@@ -500,7 +503,7 @@ def second_client(bench: ServiceBench) -> int:
 
 
 def memory_exhausted(bench: ServiceBench) -> int:
-    """The gateway gets no memory any more, and large messages."""
+    """Deny the gateway further memory, and send large messages."""
     gateway = bench.processes()["gateway"]
     hard = resource.prlimit(gateway, resource.RLIMIT_AS)[1]
 

@@ -1,11 +1,11 @@
-"""``bench soak``: virtual hours of goals, with a random fault in each, on a cell in lockstep; what grows, what is lost.
-Every goal must end in exactly one terminal event, the arm must rest after each fault and go on after an operator acts,
-no command may pass the velocity limits, and memory, descriptors and the residual of goals must stay where they were.
+"""``bench soak``: virtual hours of goals, with random faults, on a cell in lockstep; growth of resources and losses.
+Every goal must end in exactly one terminal event, the arm must rest after each fault and continue after an operator
+acts, no command may exceed the velocity limits, and memory, descriptors and the residual of goals must not grow.
 
 ``bench kills`` and ``bench soak-live``: a daemon with emulated drives in real time, for long. ``kills``: any of its
-processes is killed while the arm moves to a goal; of what the servo loop did until half a second before, how much is in
-the flight ring, and whether all of it replays bit for bit. ``soak-live``: goals, in some of them a fault that the
-daemon survives; what grows in each process and on disk, and whether events are lost.
+processes is killed while the arm moves to a goal; measured is the share of the servo loop's steps until half a second
+before that is in the flight ring, and whether all of it replays bit for bit. ``soak-live``: goals, some with a fault
+that the daemon survives; growth of each process and of disk use, and lost events.
 """
 
 from __future__ import annotations
@@ -53,28 +53,28 @@ from stereoservo_sim.world.simulated_cell import demo_cell
 
 CAMERAS = ("left", "right")
 NEAR = 0.15
-"""[rad] About the base, in which postures of goals are drawn: the markers stay in view."""
+"""Range about the base in which postures of goals are drawn [rad]: the markers stay in view."""
 GOALS = 12
 LAWS = ("stereo", "image", "cartesian3", "joints")
 LIMIT_S = 20.0
-"""Of virtual time, for a goal."""
+"""Virtual time limit of a goal."""
 RESTS_S = 1.5
-"""Coasting, braking from full speed and the drives' time-out, generously."""
+"""Time limit to rest: coasting, braking from full speed and the drives' time-out, with a margin."""
 LOOKS_S = 3.0
-"""In which a rest shows that pictures and joints agree again, after an encoder that had stuck."""
+"""Time at rest in which images and joints must agree again, after an encoder that had stuck."""
 MOVING = 1e-3
-"""[rad/s] Of any joint, by the truth."""
+"""True speed of any joint above which it counts as moving [rad/s]."""
 CREEP = FRICTION["revolute"] + MOVING
-"""[rad/s] That is not counted against an encoder which stands still: friction may hold a healthy joint so long."""
+"""True speed that is no failure with a stuck encoder [rad/s]: friction may hold a healthy joint that long."""
 STUCK_TRAVEL = 0.17 + 0.5 / 4.0 + 0.06
-"""[rad] Of an arm whose encoders stand still: until found at 1 rad/s, braking at 4 rad/s², the drives' time-out."""
+"""Travel of an arm with stuck encoders [rad]: until detected at 1 rad/s, braking at 4 rad/s², the drives' time-out."""
 QUIET = 0.4
 """Share of goals without a fault."""
 TRUTH_SAMPLES = 4096
 GOALS_PER_MEASURE = 10
-"""Goals after which memory and descriptors are read."""
+"""Number of goals between readings of memory and descriptors."""
 VIRTUAL_MINUTES = 2.0
-"""For each repetition that is asked for."""
+"""Minutes per repetition."""
 
 Act = Callable[[LockstepCell], None]
 
@@ -119,7 +119,7 @@ FAULTS: dict[str, Act] = {
 def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``repetitions`` times two virtual minutes of goals and faults; memory, descriptors, events and residuals.
 
-    Raises ExperimentError where an event is lost, a goal has no end or two, or the cell cannot be operated again.
+    Raises ExperimentError if an event is lost, a goal has no end or two, or the cell cannot be operated again.
     """
     rng = np.random.default_rng(seed)
     truth = TrueJointHistory.in_memory(len(demo_cell().robot.joints), TRUTH_SAMPLES)
@@ -128,7 +128,7 @@ def run_soak(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
 
 
 def fake_cell() -> CellFile:
-    """A cell of the fake arm and fake cameras, which has no images to render."""
+    """A cell of the fake arm and fake cameras, which render no images."""
     world = demo_cell()
     names = [joint.name for joint in world.robot.joints]
     limits = [
@@ -162,7 +162,7 @@ def fake_cell() -> CellFile:
 
 
 class _Soak:
-    """The cell, what it was sent, and what came of it."""
+    """The cell, its commands, and their results."""
 
     def __init__(self, cell: LockstepCell, truth: TrueJointHistory, rng: np.random.Generator) -> None:
         self.cell = cell
@@ -193,7 +193,7 @@ class _Soak:
             raise ExperimentError("lost", f"events {self.events} to {event.seq - 1} were lost")
 
     def run(self, seconds: float, progress: ProgressCall) -> dict[str, Any]:
-        """The figures, after so much virtual time."""
+        """The figures after this virtual time."""
         self.cell.run_for(0.5)
         self.operator.enable()
         self.operator.calibrate()
@@ -209,12 +209,12 @@ class _Soak:
         return self._figures(passed / 3600.0, time.monotonic() - started)
 
     def _measure(self, passed_s: float) -> None:
-        """Note memory and descriptors; collecting garbage for each goal would take a third of the run's time."""
+        """Record memory and descriptors; collecting garbage for each goal would take a third of the run's time."""
         gc.collect()
         self.sizes.append((passed_s / 3600.0, resident_mb(), float(len(os.listdir("/proc/self/fd")))))
 
     def _taught(self, name: str) -> tuple[FeatureTarget, dict[str, float]]:
-        """A posture as the cameras see it, and its joints."""
+        """A random posture as seen by the cameras, and its joints."""
         base = demo_cell().base
         q: FloatArray = base + self.rng.uniform(-NEAR, NEAR, len(base))
         joints = dict(zip(self.names, q.tolist(), strict=True))
@@ -261,7 +261,7 @@ class _Soak:
             self.residuals.append((passed_s / 3600.0, end.error_px))
 
     def _struck(self, law: str) -> None:
-        """A random fault; the arm rests, its cause goes, and an operator goes on."""
+        """Inject a random fault; the arm rests, the cause is removed, and an operator continues."""
         name = list(FAULTS)[int(self.rng.integers(len(FAULTS)))]
         self.faults[name] += 1
         self.last_fault = name
@@ -269,7 +269,7 @@ class _Soak:
         FAULTS[name](self.cell)
         self.cell.run_for(RESTS_S)
         _, fastest = self._true_motion()
-        blind = name == "cameras dark" and law == "joints"  # which no camera concerns
+        blind = name == "cameras dark" and law == "joints"  # which cameras do not affect
         if name == "encoder stuck":
             self._creeps(before, law)
         elif fastest > MOVING and not blind:
@@ -285,13 +285,13 @@ class _Soak:
         self._operated(name)
 
     def _true_motion(self) -> tuple[FloatArray, float]:
-        """Where the joints are (n,) [rad], and the speed of the fastest [rad/s]."""
+        """True joint positions (n,) [rad], and the speed of the fastest [rad/s]."""
         newest = self.truth.newest()
         assert newest is not None
         return newest[1], float(np.abs(newest[2]).max())
 
     def _creeps(self, before: FloatArray, law: str) -> None:
-        """A slow command to an encoder that stands still is found by travel, not by time. Raises ExperimentError."""
+        """A slow command with a stuck encoder is detected by travel, not by time. Raises ExperimentError."""
         for _ in range(round(LIMIT_S / 0.5)):
             at, fastest = self._true_motion()
             travel = float(np.abs(at - before).max())
@@ -318,7 +318,7 @@ class _Soak:
         self._seen_again(name)
 
     def _seen_again(self, name: str) -> None:
-        """Wait until the pictures agree with the joints: before, no goal by images is accepted."""
+        """Wait until the images agree with the joints: before, no goal by images is accepted."""
         for _ in range(round(LOOKS_S / 0.1)):
             assert self.cell.status is not None
             doubts = [reason.hint for reason in self.cell.status.reasons if reason.code == "CAMERAS_OR_ARM"]
@@ -355,17 +355,17 @@ class _Soak:
 # -- a live daemon ---------------------------------------------------------------------------------------------
 
 KILLS = 10
-"""For each repetition that is asked for."""
+"""Kills per repetition."""
 MINUTES = 2.0
-"""Of ``soak-live``, for each repetition that is asked for."""
+"""Minutes of ``soak-live`` per repetition."""
 SPEED_SCALE = 0.3
 YOUNG_S = 0.5
-"""Steps that are younger when a process is killed may be lost."""
+"""Steps younger than this at a kill may be lost."""
 BACK_S = 1.0
 SETTLED_S = 5.0
-"""A file of the ring that was not written to for so long is not written to any more."""
+"""A file of the ring that was not written for this time is complete."""
 EDGE_PERIODS = 5
-"""Steps by which the first and last step of a trial may lie inside its bounds without one being missed."""
+"""Number of steps by which the first and last step of a trial may lie inside its bounds without a missing one."""
 
 
 LIVE_QUIET = 0.5
@@ -374,7 +374,7 @@ HELD_S = 0.3
 
 
 class Trial(NamedTuple):
-    """When a goal began and a process was killed [ns]."""
+    """Times at which a goal began and a process was killed [ns]."""
 
     begin_ns: int
     killed_ns: int
@@ -384,7 +384,7 @@ class Trial(NamedTuple):
 def run_kills(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``repetitions`` times ten random kills: share of steps in the ring, and replays, by the process that was killed.
 
-    Raises ExperimentError where the drives or a daemon do not come up.
+    Raises ExperimentError if the drives or a daemon do not start.
     """
     rng = np.random.default_rng(seed)
     trials, present, missing = Counter[str](), Counter[str](), Counter[str]()
@@ -415,7 +415,7 @@ def run_kills(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
 
 
 def _killed(bench: ServiceBench, rng: np.random.Generator) -> Trial:
-    """A goal, and the end of a process while the arm moves."""
+    """Run a goal, and kill a process while the arm moves."""
 
     def begin(client: Client) -> None:
         end = -END if client.status().joints["j1"] > 0.0 else END
@@ -436,12 +436,12 @@ def _killed(bench: ServiceBench, rng: np.random.Generator) -> Trial:
 
 
 def _files(bench: ServiceBench) -> list[tuple[Path, float]]:
-    """Recordings, each by a link that stays where the ring moves or drops it, and the time of day of its last write."""
+    """Recordings, each by a link that remains when the ring moves or drops it, and the time of its last write."""
     found = []
     links = bench.folder / "links"
     links.mkdir(exist_ok=True)
     for path in bench.directories.recordings.rglob("*.mcap"):
-        with suppress(FileNotFoundError):  # moved aside or dropped just now
+        with suppress(FileNotFoundError):  # just moved or dropped
             link = links / path.name
             if not link.exists():
                 link.hardlink_to(path)
@@ -450,12 +450,12 @@ def _files(bench: ServiceBench) -> list[tuple[Path, float]]:
 
 
 def _recorded(bench: ServiceBench, trial: Trial) -> tuple[int, int]:
-    """How many of a trial's old steps are in the ring, and how many are not."""
+    """Number of a trial's old steps that are in the ring, and number of missing ones."""
     steps: dict[int, int] = {}
     begin_wall = time.time() - (time.monotonic_ns() - trial.begin_ns) * 1e-9
     for path, written in _files(bench):
         if written >= begin_wall:
-            with suppress(RecordingError):  # a file that is being written, or was cut; others are told by the replay
+            with suppress(RecordingError):  # a file being written, or cut; others are reported by the replay
                 for topic, data in recorded_messages(path):
                     if topic == "step":
                         record = decode_step(data)
@@ -471,7 +471,7 @@ def _recorded(bench: ServiceBench, trial: Trial) -> tuple[int, int]:
 
 
 def _replay(bench: ServiceBench, replays: dict[str, str], settled_s: float) -> None:
-    """Replay the files, by name, that are not in ``replays`` and were not written to for so long; what differs."""
+    """Replay the files, by name, that are not in ``replays`` and are complete; returns the differences."""
     for path, written in _files(bench):
         if path.name in replays or time.time() - written < settled_s:
             continue
@@ -489,7 +489,7 @@ def _replay(bench: ServiceBench, replays: dict[str, str], settled_s: float) -> N
 def run_soak_live(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``repetitions`` times two minutes of goals in real time; memory, descriptors, disk, events.
 
-    Raises ExperimentError where a goal has two ends, or the drives or the daemon do not come up.
+    Raises ExperimentError if a goal has two ends, or the drives or the daemon do not start.
     """
     seconds = repetitions * MINUTES * 60.0
     with running_bench() as bench:
@@ -505,7 +505,7 @@ def run_soak_live(repetitions: int, seed: int, progress: ProgressCall) -> dict[s
 
 
 class _LiveSoak:
-    """What a daemon was sent, what it told, and the sizes of its processes."""
+    """A daemon's commands and events, and the sizes of its processes."""
 
     def __init__(self, bench: ServiceBench, client: Client, rng: np.random.Generator) -> None:
         self.bench, self.client, self.rng = bench, client, rng
@@ -540,23 +540,25 @@ class _LiveSoak:
         try:
             self.client.hold()
             time.sleep(HELD_S)
-        finally:  # a hold whose answer did not come in time may hold all the same
+        finally:  # a hold may take effect even if its answer was late
             self.bench.asked(lambda client: client.resume())
 
     def one_goal(self) -> None:
-        """Send a goal, do something to the daemon in half of them, and wait for its end. Raises ExperimentError."""
+        """Send a goal, inject a fault into the daemon in half of the cases, and wait for its end. Raises
+        ExperimentError.
+        """
         self.bench.ready()
         try:
             goal = self._goal(lease_s=LIMIT_S)
         except RefusedError as refused:
-            # A machine that stalls between the two leaves the drives in a fault of their own.
+            # A machine that stalls in between leaves the drives in a fault of their own.
             self.faults[f"refused: {refused}"] += 1
             return
         if self.rng.random() > LIVE_QUIET:
             time.sleep(float(self.rng.uniform(0.0, 1.0)))
             name = list(self.acts)[int(self.rng.integers(len(self.acts)))]
             self.faults[name] += 1
-            with suppress(RefusedError):  # a goal that has ended already is not held
+            with suppress(RefusedError):  # a goal that has already ended cannot be held
                 self.acts[name]()
         until = time.monotonic() + 2 * LIMIT_S
         while not (ends := self._ends(goal)):
@@ -570,7 +572,7 @@ class _LiveSoak:
         self.outcomes[ends[0]] += 1
 
     def _without_end(self, goal: str) -> str:
-        """What is known of a goal of which no end was heard."""
+        """Known facts on a goal without a received end."""
         asked = [event.kind for event in self.client.events(0).events if event.id == goal]
         status = self.client.status()
         return (
@@ -583,7 +585,7 @@ class _LiveSoak:
         return [event.kind for event in tuple(self.told) if event.id == goal and event.kind in TERMINAL]
 
     def measure(self, hours: float) -> None:
-        """Note the sizes of the processes that were never replaced, and of what is on the disk."""
+        """Record the sizes of the processes that were never replaced, and of the files on disk."""
         for name, pid in self.bench.processes().items():
             if name.startswith("vision-left"):
                 continue
@@ -593,7 +595,7 @@ class _LiveSoak:
         self.disk_mb.append(sum(path.stat().st_size for path in files if path.is_file()) / 1e6)
 
     def figures(self, hours: float) -> dict[str, Any]:
-        """Slopes after a quarter of the time, in which caches become warm."""
+        """Slopes after a quarter of the time, in which caches warm up."""
         numbers: dict[str, set[int]] = {}
         for event in self.told:
             numbers.setdefault(event.boot, set()).add(event.seq)
@@ -612,7 +614,7 @@ class _LiveSoak:
 
 
 def _slopes(sizes: FloatArray) -> dict[str, Any]:
-    """Of one process: rows of hours, megabytes and descriptors."""
+    """Slopes of one process from rows of hours, megabytes and descriptors."""
     warm = sizes[len(sizes) // 4 :]
     slope = float(np.polyfit(warm[:, 0], warm[:, 1], 1)[0]) if len(warm) > 1 else None
     return {

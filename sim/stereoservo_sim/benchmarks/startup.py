@@ -1,5 +1,5 @@
-"""``bench startup``: a cell's first start with an empty cache of compiled kernels beside its second one, what compiles
-in which process, and what commands cost before they do anything.
+"""``bench startup``: a cell's first start with an empty cache of compiled kernels beside its second one, the kernels
+compiled in each process, and the base cost of commands.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ COMPILED_S = 900.0
 
 
 def wait_compiled(client: Client) -> StateMessage:
-    """The state of a cell once it has all kernels, which the first start on a computer compiles.
+    """The state of a cell once it has all kernels; the first start on a computer compiles them.
 
     Raises TimedOutError.
     """
@@ -49,10 +49,11 @@ def wait_compiled(client: Client) -> StateMessage:
 
 
 def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: what the
-    first compiled. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
+    """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: compiled by
+    the
+    first. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
 
-    Raises ExperimentError where the daemon does not come up.
+    Raises ExperimentError if the daemon does not start.
     """
     commands = _commands(repetitions, progress)
     with tempfile.TemporaryDirectory(prefix="stereoservo-startup-") as scratch:
@@ -81,10 +82,11 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
 
 
 def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
-    """Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
-    and until all kernels are loaded. CPU seconds of what prepares the start, of what compiles beside the work, and of
-    the others until the trial motions. ``overruns``: cycles that came late, those behind a kernel that was loaded at
-    rest among them.
+    """Wall and CPU seconds of a start.
+
+    Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
+    and until all kernels are loaded. CPU seconds of the preparation of the start, of background compilation, and of the
+    others until the trial motions. ``overruns``: late cycles, including those due to a kernel that was loaded at rest.
     """
     began = time.monotonic()
     text, log = folder / f"{name}.txt", folder / f"{name}.log"
@@ -142,10 +144,10 @@ def _children_cpu() -> float:
 
 
 def compiled_kernels(log: Path) -> list[dict[str, Any]]:
-    """The kernels that the processes with this log have compiled, the longest first. ``repeated``: a signature that two
-    processes compiled, or two of this package's own that one kernel was compiled for.
+    """The kernels compiled by the processes with this log, the longest first. ``repeated``: a signature that two
+    processes compiled, or one kernel of this package that was compiled for two signatures.
 
-    numba compiles functions of its own, such as ``np.zeros``, in each process; they are not cached.
+    numba compiles its own functions, such as ``np.zeros``, in each process; they are not cached.
     """
     found: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for line in _lines(log):
@@ -185,7 +187,7 @@ def _commands(repetitions: int, progress: ProgressCall) -> dict[str, Any]:
 
 
 def show_startup(figures: dict[str, Any], console: Console) -> dict[str, Any]:
-    """The table of what compiles; the rest of the figures."""
+    """Print the table of compiled kernels; returns the rest of the figures."""
     table = Table("kernel", "signatures", "seconds", "processes", box=None)
     for row in figures["kernels"]:
         table.add_row(row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"]))

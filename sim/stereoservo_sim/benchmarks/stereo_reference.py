@@ -34,7 +34,7 @@ def stereo_law(
     """``q̇ = −gain·J⁺(s − s*)`` over all cameras stacked (8.36).
 
     ``jacobian`` (c, m, 2, n) [px/rad or px/m], ``pixels`` and ``set_points`` (c, m, 2) [px], ``weights`` (c,
-    m) = 1/sigma [1/px], 0 where a marker is missing (its rows are then not read, NaN is allowed there).
+    m) = 1/sigma [1/px], 0 for a missing marker (its rows are then not read and may be NaN).
     ``gain`` [1/s].
     """
     n = jacobian.shape[-1]

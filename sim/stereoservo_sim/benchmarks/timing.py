@@ -14,11 +14,11 @@ import numpy as np
 
 STAT = Path("/proc/stat")
 STOLEN = 7
-"""Place of the stolen time among the numbers of /proc/stat's first line, in ticks."""
+"""Index of the stolen time among the numbers of /proc/stat's first line, in ticks."""
 
 
 def timed(call: Callable[[int], object], repetitions: int, warm_up: int = 1) -> tuple[list[float], list[float]]:
-    """Wall and CPU seconds of ``call(k)`` for k = 0, 1, …, after ``warm_up`` calls that do not count."""
+    """Wall and CPU seconds of ``call(k)`` for k = 0, 1, …, after ``warm_up`` uncounted calls."""
     for k in range(warm_up):
         call(k)
     wall, cpu = [], []
@@ -47,7 +47,7 @@ def summary(samples: list[float], scale: float = 1.0, digits: int = 4) -> dict[s
 
 
 def machine() -> dict[str, Any]:
-    """Properties of the machine and its software, which a figure needs."""
+    """Properties of the machine and its software, reported with a figure."""
     import numba
 
     return {
@@ -72,7 +72,7 @@ def _processor() -> str:
 
 
 def stolen_ticks() -> tuple[int, int] | None:
-    """Stolen and total ticks of all processors since boot; None where the system does not report them."""
+    """Stolen and total ticks of all processors since boot; None if the system does not report them."""
     if not sys.platform.startswith("linux"):
         return None
     try:
@@ -90,6 +90,6 @@ def stolen_share(before: tuple[int, int] | None, after: tuple[int, int] | None) 
 
 
 def resident_mb(process: int | str = "self") -> float:
-    """Memory [MB] that a process has."""
+    """Resident memory of a process [MB]."""
     pages = int(Path(f"/proc/{process}/statm").read_text(encoding="ascii").split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6

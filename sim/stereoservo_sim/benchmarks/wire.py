@@ -1,4 +1,4 @@
-"""``bench wire``: how long messages take between a client and the servo loop of a daemon, beside bare zenoh over the
+"""``bench wire``: latency of messages between a client and the servo loop of a daemon, beside bare zenoh over the
 same router.
 """
 
@@ -40,9 +40,9 @@ driver = "fake"
 [calibration]
 base = {{ j1 = 0.0, j2 = -1.3, j3 = -0.4, j4 = 0.0, j5 = 0.0, j6 = 0.0 }}
 """
-"""The drivers without physics and pictures: what is timed is the wire."""
+"""Drivers without physics and images, so that only the wire is timed."""
 CALLS = 100
-"""Of each kind, for each repetition that is asked for."""
+"""Calls of each kind per repetition."""
 GOALS = 10
 ECHO = """
 import sys, time
@@ -53,16 +53,20 @@ print("ready", flush=True)
 sys.stdin.read()
 session.close()
 """
-"""A process that answers at once, until its standard input ends."""
+"""Program that replies at once, until its standard input ends."""
 
 
 def run_wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``query_us``: a question to and its answer from another process, by bare zenoh and from the gateway (``status``);
-    ``command_us``: with the servo loop between (``hold``). ``put_us``: what a put takes its caller. ``one_way_us``:
-    from a message's making (a cycle, or a frame's arrival) to a client that waits for it. ``goal_us``: from sending a
-    joint goal to the cycle of its first command, and to the reply.
+    """Latencies of messages, by kind.
 
-    Raises ExperimentError where the daemon does not come up.
+    ``query_us``: a query to another process and its reply, by bare zenoh and from the gateway (``status``);
+    ``command_us``: with the servo loop between (``hold``). ``put_us``: duration of a put for its caller.
+    ``one_way_us``:
+    from the creation of a message (a cycle, or a frame's arrival) to a client that waits for it. ``goal_us``: from
+    sending
+    a joint goal to the cycle of its first command, and to the reply.
+
+    Raises ExperimentError if the daemon does not start.
     """
     calls = repetitions * CALLS
     with tempfile.TemporaryDirectory(prefix="stereoservo-wire-") as scratch:
@@ -116,7 +120,7 @@ def _echo(endpoint: str) -> Iterator[None]:
 
 
 def _times(call: Callable[[], object], count: int) -> list[float]:
-    """Seconds of each call, with a pause between them that is no multiple of the loop's period."""
+    """Seconds of each call, with pauses that are no multiple of the loop's period."""
     samples = []
     for _ in range(count):
         time.sleep(0.0033)
@@ -135,7 +139,7 @@ def _of_features(data: bytes) -> int:
 
 
 def _one_way(client: Client, key: str, stamp: Callable[[bytes], int], count: int) -> list[float]:
-    """Seconds from a message's stamp until a client that waits for it has it."""
+    """Seconds from a message's stamp until a waiting client receives it."""
     samples = []
     subscriber = client.session.declare_subscriber(key)
     try:
@@ -149,7 +153,7 @@ def _one_way(client: Client, key: str, stamp: Callable[[bytes], int], count: int
 
 
 def _goals(client: Client, count: int) -> dict[str, list[float]]:
-    """Of joint goals, one after the other: seconds from sending to the cycle of the first command, and to the reply."""
+    """Successive joint goals: seconds from sending to the cycle of the first command, and to the reply."""
     begins, replies = [], []
     joint, start = next(iter(client.status().joints.items()))
     for k in range(count):

@@ -35,13 +35,13 @@ BENCHES = {
     "watch": "stereoservo_sim.benchmarks.live_loop:run_watch",
     "wire": "stereoservo_sim.benchmarks.wire:run_wire",
 }
-"""By the name given on the command line: ``(repetitions, seed, progress)`` to the figures, loaded when it runs."""
+"""Benches by name: functions of ``(repetitions, seed, progress)`` that return the figures, loaded when run."""
 SHOWN = {
     "detectors": "stereoservo_sim.benchmarks.photographs:show_detectors",
     "faults": "stereoservo_sim.benchmarks.faults.bench:show_faults",
     "startup": "stereoservo_sim.benchmarks.startup:show_startup",
 }
-"""What prints some of an answer in its own way, and gives the rest."""
+"""Functions that print part of an answer in a special form, and return the rest."""
 
 
 def bench(
@@ -93,7 +93,7 @@ def _loaded(name: str) -> Callable[..., Any]:
 
 
 def _show(answer: dict[str, Any], console: Console) -> None:
-    """Print one line a figure, nested names joined by points; what a bench shows in its own way before."""
+    """Print one line per figure, nested names joined by points; after the bench's own output, if any."""
     if answer["bench"] in SHOWN:
         answer = _loaded(SHOWN[answer["bench"]])(answer, console)
     for name, value in _flat(answer, ""):

@@ -30,7 +30,7 @@ from stereoservo_sim.world.presets import MechanicsPreset
 if TYPE_CHECKING:
     from stereoservo_sim.world.simulated_cell import SimulatedCell
 
-# By their names alone: --help imports nothing numerical.
+# Names only, so that --help imports nothing numerical.
 MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in get_args(MechanicsPreset)})  # type: ignore[misc]
 
 
@@ -102,7 +102,7 @@ def demo(
 
 
 def _checked(cell: CellFile, folder: Path, lockstep: bool) -> SimulatedCell:
-    """The simulation behind a cell that can be demonstrated, and judged by it. Raises ValueError."""
+    """Ground truth of a cell that can be demonstrated and evaluated. Raises ValueError."""
     from stereoservo_sim.demonstration.truth import true_cell
 
     truth = true_cell(cell, folder)

@@ -19,7 +19,7 @@ from stereoservo.daemon.process_control import Termination, die_with_parent
 from stereoservo.messages.cell_file import CellFile, load_cell_file
 
 PRIORITY = 5
-"""SCHED_FIFO where it is allowed: below the servo process, above everything that only computes."""
+"""SCHED_FIFO priority, if allowed: below the servo process, above processes that only compute."""
 GRACE_S = 5.0
 
 
@@ -91,7 +91,7 @@ def _drives(settings: _Settings, termination: Termination) -> None:
     cell = load_cell_file(path)
     directories = cell_directories(cell.cell.name)
     create_directories(directories)
-    # As long as it is held, a daemon that cleans this directory up leaves the truth alone.
+    # While it is held, a daemon that cleans up this directory leaves the truth file.
     lock = directories.runtime / f"{FILE_NAME}.lock"
     with FileLock(lock, f"the emulated arm of cell {cell.cell.name!r}"):
         _serve(path, cell, directories.runtime, settings, termination)
@@ -145,9 +145,9 @@ def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, t
     server = BusServer(emulator, endpoint)
     console = Console(server, printer)
     console.attach()
-    with contextlib.suppress(OSError):  # not allowed: then without
+    with contextlib.suppress(OSError):  # may not be allowed
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    gc.freeze()  # what was imported is not looked through again
+    gc.freeze()  # imported objects are not scanned again
     printer.say(
         "ready",
         f"listening on {server.channel}",
@@ -186,7 +186,7 @@ def _cameras(settings: _Settings, termination: Termination) -> None:
 
 
 def _conveyor(settings: _Settings, termination: Termination) -> None:
-    """The belt runs until the end; the part then stays where it is."""
+    """Run the belt until the end; the part then stays at its position."""
     from stereoservo.messages.directories import cell_directories, create_directories
     from stereoservo_sim.emulators.console import Printer
     from stereoservo_sim.emulators.fault_engine import EmulationError

@@ -62,7 +62,7 @@ def reproduce(experiment: str, seed: int, plot: Path | None, html: Path | None, 
 
 
 def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: dict[str, Any]) -> None:
-    """Run every experiment of the thesis; print each one's rows as they come. Raises ExperimentError, OSError."""
+    """Run every experiment of the thesis; print the rows of each when complete. Raises ExperimentError, OSError."""
     from stereoservo_sim.experiments.thesis_page import Reproduction, answer_of_all, page, reproduce_all
 
     if plot is not None:
@@ -72,7 +72,7 @@ def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: 
         raise ExperimentError("option", f"{ALL} does not take --{asked[0].replace('_', '-')}")
     if html is not None:
         _make_folder(html.parent)
-        with html.open("a"):  # what cannot be written is told before the minutes that it takes
+        with html.open("a"):  # an unwritable file is reported before a run of minutes
             pass
     console = Console(markup=False)
 
@@ -95,7 +95,7 @@ def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: 
 
 
 def _signature() -> inspect.Signature:
-    """The command's options: the common ones, and each that an experiment declares."""
+    """The command's options: the common ones, and those declared by experiments."""
     takers: dict[str, list[str]] = {}
     options: dict[str, Option] = {}
     for declared in EXPERIMENTS.values():

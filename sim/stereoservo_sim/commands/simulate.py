@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stereoservo_sim.tasks.closed_loop import LoopSettings
     from stereoservo_sim.tasks.task_file import AlignmentTask
 
-# By their names alone: --help imports no law, and nothing numerical.
+# Names only, so that --help imports no law, and nothing numerical.
 LawOption = StrEnum("LawOption", {name: name for name in plugins.names(plugins.LAWS)})  # type: ignore[misc]
 LAW = LawOption(DEFAULT_LAW)
 MechanicsChoice = StrEnum("MechanicsChoice", {name: name for name in get_args(MechanicsPreset)})  # type: ignore[misc]
@@ -154,7 +154,7 @@ def simulate(
 
 
 def _given(file: Path | None, draw: int | None, seed: int) -> tuple[AlignmentTask, ...]:
-    """Tasks of a file, or drawn."""
+    """Tasks of a file, or random ones."""
     from stereoservo_sim.tasks.random_tasks import random_tasks
     from stereoservo_sim.tasks.task_file import read_tasks
 
@@ -166,7 +166,7 @@ def _given(file: Path | None, draw: int | None, seed: int) -> tuple[AlignmentTas
 def _answer(
     tasks: tuple[AlignmentTask, ...], limit: int | None, ids: str | None, settings: LoopSettings, jobs: int
 ) -> dict[str, Any]:
-    """What the tasks came to."""
+    """Results of the tasks."""
     from stereoservo_sim.tasks.campaign import default_jobs, run_campaign
 
     chosen = _chosen(tasks, limit, ids)
@@ -178,7 +178,7 @@ def _answer(
 
 
 def _usable(law: LawOption) -> str:
-    """The name of a law that is installed, and not broken."""
+    """Name of a law that is installed and can be loaded."""
     from stereoservo.control.law_registry import LAWS
 
     name = str(law.value)
@@ -281,7 +281,7 @@ SHOWN = {
     "rest_mrad_s": ("turn rate at rest, rms", " mrad/s"),
     "iterations": ("steps", ""),
 }
-"""Of the answer: names and units for people."""
+"""Names and units of the answer's values, for people."""
 
 
 def _number(value: float | None) -> str:

@@ -1,1 +1,1 @@
-"""The demonstration: an uncalibrated cell calibrates itself, is taught goals, and reaches them."""
+"""The demonstration: an uncalibrated cell calibrates itself, records taught goals, and reaches them."""

@@ -1,4 +1,4 @@
-"""The belt of a demonstration: it carries one part after the other past the arm, and the truth of where they were."""
+"""The conveyor of a demonstration: carries parts one after the other past the arm; ground truth of their motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereoservo_sim.world.workpiece import Motion, Moved, MovedFile, moved_pose
 
 
 class Belt:
-    """The belt of a cell, switched by the file in its ``runtime_dir``; ``now_ns``: the clock of the cell's cameras."""
+    """The conveyor of a cell, switched by the file in its ``runtime_dir``; ``now_ns``: clock of the cell's cameras."""
 
     def __init__(self, conveyor: Conveyor, runtime_dir: Path, now_ns: Callable[[], int]) -> None:
         self.conveyor = conveyor
@@ -30,7 +30,7 @@ class Belt:
         self.place(AWAY)
 
     def put(self) -> None:
-        """Put a part onto the belt, which stands."""
+        """Put a part onto the stopped belt."""
         self.place(self.conveyor.begin)
 
     def run(self) -> None:
@@ -38,13 +38,13 @@ class Belt:
         self.place(self.conveyor.running(self._now_ns()))
 
     def place(self, moved: Moved) -> None:
-        """Let the part stand, or move, as ``moved``."""
+        """Set the part's displacement or motion to ``moved``."""
         self._since.append(self._now_ns())
         self._moved.append(moved)
         self._file.write(moved)
 
     def moved(self, t_ns: int) -> Moved:
-        """Where the part was at ``t_ns``."""
+        """Displacement of the part at ``t_ns``."""
         k = bisect_right(self._since, t_ns) - 1
         if k < 0:
             return Moved()
@@ -52,19 +52,19 @@ class Belt:
         return moved.at(t_ns) if isinstance(moved, Motion) else moved
 
     def stops_ns(self, t_ns: int) -> int:
-        """When the motion that was under way at ``t_ns`` ended, or ends."""
+        """End time of the motion that was in progress at ``t_ns``."""
         moved = self._moved[bisect_right(self._since, t_ns) - 1]
         assert isinstance(moved, Motion)
         assert moved.since_ns is not None
         return moved.since_ns + round((moved.for_s or np.inf) * 1e9)
 
     def cell_at(self, cell: SimulatedCell, t_ns: int) -> SimulatedCell:
-        """``cell`` with the part where it was at ``t_ns``."""
+        """``cell`` with the part at its pose at ``t_ns``."""
         return with_part(cell, self.moved(t_ns))
 
 
 def with_part(cell: SimulatedCell, moved: Moved) -> SimulatedCell:
-    """``cell`` whose body, before cameras on the arm, was ``moved``."""
+    """``cell`` with its part displaced by ``moved``: the body, if the cameras are on the arm."""
     assert cell.stand is not None
     stand: FloatArray = moved_pose(cell.stand, moved)
     return replace(cell, stand=stand)

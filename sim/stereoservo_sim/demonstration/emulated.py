@@ -12,9 +12,9 @@ from stereoservo_sim.world.presets import MechanicsPreset
 HEADING = re.compile(r"^\[", re.MULTILINE)
 SOURCE = re.compile(r"^(\s*source\s*=\s*)\"http://127\.0\.0\.1:\d+/", re.MULTILINE)
 ANY_SERVER = "http://127.0.0.1:0"
-"""For emulated cameras: any free port of this host; the emulator reports which."""
+"""Address for emulated cameras: any free port of this host, reported by the emulator."""
 ANY_PORT = "socket://127.0.0.1:0"
-"""For an emulator: any free port of this host, which it reports."""
+"""Address for an emulator: any free port of this host, reported by it."""
 
 
 def has_emulated_drives(cell: CellFile) -> bool:
@@ -30,7 +30,7 @@ def has_emulated_cameras(cell: CellFile) -> bool:
 def move_to_server(cell_path: Path, folder: Path, channel: str) -> Path:
     """Copy of the cell file in ``folder`` whose cameras of driver ``video`` use the server ``channel``.
 
-    ``channel``: ``http://127.0.0.1:PORT``. Raises ValueError where no camera's ``source`` is an address of this host.
+    ``channel``: ``http://127.0.0.1:PORT``. Raises ValueError if no camera's ``source`` is an address of this host.
     """
     text = cell_path.read_text(encoding="utf-8")
     changed, count = SOURCE.subn(lambda found: f'{found[1]}"{channel}/', text)
@@ -42,9 +42,9 @@ def move_to_server(cell_path: Path, folder: Path, channel: str) -> Path:
 
 
 def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
-    """Copy of the cell file in ``folder`` whose joint driver uses ``channel``; ``eds`` stays the same file.
+    """Copy of the cell file in ``folder`` whose joint driver uses ``channel``; ``eds`` remains the same file.
 
-    Raises ValueError where the file has no ``[joints.options]`` with a ``channel``.
+    Raises ValueError if the file has no ``[joints.options]`` with a ``channel``.
     """
     text = cell_path.read_text(encoding="utf-8")
     text = _replaced(text, "channel", channel, cell_path)
@@ -54,7 +54,7 @@ def move_to_channel(cell_path: Path, folder: Path, channel: str) -> Path:
 def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Path:
     """Copy of the cell file in ``folder`` whose simulated arm, or emulated drives, have the mechanics ``preset``.
 
-    Raises ValueError where the cell has neither, or its file states them in a form that is not replaced.
+    Raises ValueError if the cell has neither, or its file states them in a form that cannot be replaced.
     """
     text = cell_path.read_text(encoding="utf-8")
     tree = tomllib.loads(text)
@@ -82,7 +82,7 @@ def with_mechanics(cell_path: Path, folder: Path, preset: MechanicsPreset) -> Pa
 
 
 def _with_its_files(text: str, cell_path: Path) -> str:
-    """``text`` of a cell file with what it names relative to itself named from everywhere."""
+    """``text`` of a cell file with its relative paths (EDS, URDF) made absolute."""
     tree = tomllib.loads(text)
     eds = tree["joints"].get("options", {}).get("eds", "")
     if eds:

@@ -24,7 +24,7 @@ TRACK_POINTS = 200
 
 @dataclass
 class Course:
-    """Time series of a cell's run: times (k,), errors (k,), commands (k, n), goals' ids, and every event."""
+    """Time series of a cell's run: times (k,), errors (k,), commands (k, n), ids of goals, and every event."""
 
     t_ns: IntArray
     error_px: FloatArray
@@ -44,7 +44,7 @@ class RecordedDemonstration(Course):
 
 @dataclass(frozen=True)
 class Judgement:
-    """Evaluation of one goal against ground truth. Errors are of the mean over one second after the arm came to
+    """Evaluation of one goal against ground truth. Errors are those of the mean over one second after the arm came to
     rest.
     """
 
@@ -69,10 +69,13 @@ class Judgement:
 
 @dataclass(frozen=True)
 class Steady:
-    """How a part that moved was followed: from when it was met, ``met_s`` after the goal's start, for ``seconds``,
-    until the belt stood: distance of a marker from where the goal has it, rms and largest over markers, cameras and
-    time, what it stayed below for 99 % of the time, and the largest in space; the part's ``speed_mm_s``. NaN where it
-    was not met.
+    """Accuracy of following a moving part, from when it was met, ``met_s`` after the goal's start, for ``seconds``,
+    until
+    the belt stopped.
+
+    Distance of a marker from its position in the goal: rms and largest over markers, cameras and time, 99 % quantile
+    over
+    time, and the largest in space; the part's ``speed_mm_s``. NaN if it was not met.
     """
 
     speed_mm_s: float
@@ -85,7 +88,7 @@ class Steady:
 
 
 def read_flight(recording: Path) -> RecordedDemonstration:
-    """Replay a recording and collect what the report needs. Raises RecordingError."""
+    """Replay a recording and collect the data for the report. Raises RecordingError."""
     times: list[int] = []
     errors: list[float] = []
     commands: list[FloatArray] = []
@@ -127,8 +130,8 @@ def judge_goal(
     cell: SimulatedCell,
     belt: Belt | None = None,
 ) -> Judgement:
-    """Evaluate the goal that was taught as ``name`` and executed with ``law``, on a part that a ``belt`` carried.
-    Raises LookupError where it was not executed.
+    """Evaluate the goal that was taught as ``name`` and executed with ``law``, on a part carried by a ``belt``.
+    Raises LookupError if it was not executed.
     """
     taught = next((e for e in flight.events if e.kind == "taught" and e.name == name), None)
     if taught is None:
@@ -172,7 +175,7 @@ def judge_goal(
 
 
 class _Places:
-    """The cell with its part where the belt had it."""
+    """The cell with its part at its pose on the belt over time."""
 
     def __init__(self, cell: SimulatedCell, belt: Belt | None) -> None:
         self.cell, self._belt = cell, belt
@@ -189,7 +192,7 @@ def _steady(
     places: _Places,
     belt: Belt,
 ) -> Steady:
-    """Of a goal that set out at ``start`` and was ``shown`` at joints (k, n)."""
+    """Following accuracy of a goal that started at ``start`` and was taught at joints ``shown`` (k, n)."""
     speed = 1e3 * float(np.linalg.norm(belt.conveyor.velocity_m_s))
     met = next((e for e in flight.events if e.kind == "target_met" and e.id == start.id), None)
     if met is None:
@@ -222,7 +225,9 @@ def _steady(
 
 
 def _flown(name: str, flight: Course) -> tuple[Event, Event]:
-    """Start and end of the execution of the n-th taught goal, which follows all teaching in the same order."""
+    """Start and end of the execution of the goal ``name``: goals are executed in the order of teaching, after all of
+    it.
+    """
     taught = [e.name for e in flight.events if e.kind == "taught"]
     begun = [e for e in flight.events if e.kind == "goal_started" and e.name in LAWS]
     order = taught.index(name)
@@ -234,7 +239,7 @@ def _flown(name: str, flight: Course) -> tuple[Event, Event]:
 
 
 def _during(times: IntArray, positions: FloatArray, start_ns: int, end_ns: int) -> FloatArray:
-    """Every fifth ground truth sample of an interval. Raises LookupError where there is none."""
+    """Every fifth ground truth sample of an interval. Raises LookupError if there is none."""
     inside = positions[(times >= start_ns) & (times <= end_ns)]
     if len(inside) == 0:
         raise LookupError(f"no true joint position between {start_ns} and {end_ns} ns")
@@ -242,8 +247,8 @@ def _during(times: IntArray, positions: FloatArray, start_ns: int, end_ns: int) 
 
 
 def _pixel_error(place: SimulatedCell, reached: FloatArray, cell: SimulatedCell, shown: FloatArray) -> float:
-    """Largest distance, over cameras and markers seen at the goal, of the mean noise-free reprojections [px] at joints
-    ``reached`` in ``place`` from those ``shown`` in ``cell``.
+    """Largest distance [px], over cameras and markers seen at the goal, of the mean noise-free reprojections at joints
+    ``reached`` in ``place`` from those at joints ``shown`` in ``cell``.
     """
     worst = 0.0
     for camera in cell.rig.cameras:

@@ -1,4 +1,4 @@
-"""Operator of a cell in lockstep: enables, calibrates, teaches, sends goals and waits for their ends."""
+"""Operator of a cell in lockstep: enables, calibrates, teaches, sends goals and waits until they end."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class LockstepOperator:
 
     @property
     def _last_event(self) -> int:
-        """Number of the last event so far. Taken before a request, since effects may come before its reply."""
+        """Number of the newest event. Read before a request, since effects may precede its reply."""
         return self.cell.events[-1].seq if self.cell.events else 0
 
     def _measure(self, *, check: bool) -> TrialData:
@@ -154,14 +154,14 @@ class LockstepOperator:
         return event
 
     def goal(self, target: Target | str, *, timeout_s: float = 120.0, **options: object) -> Event:
-        """Run a goal (a taught one by its name) to its end. Raises LockstepRefusalError when it is refused."""
+        """Run a goal (a taught one by its name) to its end. Raises LockstepRefusalError if it is refused."""
         goal = self._goal(target, **options)
         since = self._last_event
         self._submit(RunGoal(goal))
         return self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, timeout_s, since)
 
     def planned(self, target: Target | str, **options: object) -> PlanReport:
-        """Plan of a goal, without motion. Raises LockstepRefusalError when it is refused."""
+        """Plan of a goal, without motion. Raises LockstepRefusalError if it is refused."""
         reply = self._submit(RunGoal(self._goal(target, check=True, **options)))
         if reply.plan is None:
             raise ValueError(f"goals of this kind are not planned: {target}")

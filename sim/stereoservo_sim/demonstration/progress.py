@@ -1,4 +1,4 @@
-"""What a demonstration tells its command: progress, and that it did not succeed."""
+"""Interface of a demonstration to its command: progress, and the error of a failed demonstration."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ class DemoFailedError(Exception):
 
 @dataclass(frozen=True)
 class DemonstrationProgress:
-    """Protocol of a progress reporter: lines of text, and a fraction of the present work."""
+    """Protocol of a progress reporter: lines of text, and the completed fraction of the current work."""
 
     tell: Callable[[str], None]
     progress: Callable[[float], None]

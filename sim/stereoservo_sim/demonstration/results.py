@@ -35,17 +35,17 @@ from stereoservo_sim.world.simulated_cell import SimulatedCell
 MAX_ERROR_PX = 0.3
 MAX_ERROR_MM = 0.5
 MAX_STEADY_PX = 1.0
-"""While a part moves at a steady speed, for 99 % of the time: a busy computer may hold the arm for a moment."""
+"""Error limit for 99 % of the time while a part moves steadily; a busy computer may delay the arm briefly."""
 MAX_MET_PX = 0.5
-"""Of a part that was met while it moved, when it stands: the cell's tolerance."""
+"""Error limit of a part that was met while it moved, after it has stopped: the cell's tolerance."""
 MAX_MET_MM = 2.0
-"""Depth is seen ten times less than the rest."""
+"""The same in space; depth is measured ten times less accurately than the other directions."""
 
 
 def summary(demonstration: Demonstration, seconds: float) -> dict[str, Any]:
     """Evaluate, write ``report.html`` and ``overview.png``; returns what ``demo --json`` prints.
 
-    ``seconds``: how long the demonstration took. Raises RecordingError, LookupError where a goal was never flown.
+    ``seconds``: duration of the demonstration. Raises RecordingError; LookupError if a goal was never executed.
     """
     flight = read_flight(demonstration.recording)
     truth = demonstration.truth
@@ -116,7 +116,7 @@ def _unsteady(steady: Steady) -> list[str]:
 
 
 def false_verdicts(verdicts: Sequence[str]) -> list[str]:
-    """Nothing is wrong with a simulated arm: whatever the watch over the model named is a problem."""
+    """Faults reported by the model monitor; a simulated arm has none, so each is a problem."""
     return [f"the watch over the model named {verdict!r}, and nothing had changed" for verdict in verdicts]
 
 
@@ -253,7 +253,7 @@ def _calibration_page(demonstration: Demonstration, trials: TrialData) -> Calibr
 
 
 def residuals(model: CellModel, trials: TrialData) -> FloatArray:
-    """Measured minus predicted raw pixels (c, s, m, 2), NaN where a marker was not seen."""
+    """Measured minus predicted raw pixels (c, s, m, 2), NaN for markers that were not seen."""
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
     matrices = np.array([camera.matrix for camera in model.cameras])
     rows = [model.marker_ids.index(marker) for marker in trials.marker_ids]
@@ -290,10 +290,10 @@ def _goal(goal: Judgement, gain: float) -> GoalPlots:
     )
 
 
-# -- how the report looks ------------------------------------------------------------------------------------
+# -- layout of the report --------------------------------------------------------------------------------------
 # HTML report of a servoing session, from arrays; deterministic.
 #
-# The pictures are embedded, so that the file can be mailed as it is.
+# The images are embedded, so that the file can be mailed as it is.
 
 
 __all__ = ["CalibrationPlots", "GoalPlots", "ReportData", "render_report", "write_report"]
@@ -433,11 +433,11 @@ height: auto; }} figcaption {{ color: #555; font-size: .85rem; }} </style></head
 
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666", "#8b5a2b")
-"""One a joint, in this order everywhere; distinguishable for colour-blind readers, too (Okabe and Ito)."""
+"""One colour per joint, in this order everywhere; distinguishable for colour-blind readers (Okabe and Ito)."""
 
 DPI = 110
 LEAST_ERROR_PX = 1e-4
-"""Floor of the logarithmic axis: below it an error is zero to the eye."""
+"""Floor of the logarithmic axis: smaller errors appear as zero."""
 
 
 def draw_calibration_tracks(c: CalibrationPlots) -> Figure:
@@ -459,8 +459,7 @@ def draw_calibration_tracks(c: CalibrationPlots) -> Figure:
 
 
 def draw_residuals(c: CalibrationPlots) -> Figure:
-    """Histograms of residual coordinates: a row a joint, a column a camera; the expected Gaussian over
-    them."""
+    """Histograms of residual coordinates: a row per joint, a column per camera; with the expected Gaussian."""
     groups = [(j, name) for j, name in enumerate(c.joints) if (c.joint == j).any()]
     figure = _figure(4.2 * len(c.cameras), 0.7 + 1.25 * max(len(groups), 1))
     axes = figure.subplots(max(len(groups), 1), len(c.cameras), squeeze=False, sharex=True)
@@ -487,7 +486,7 @@ def draw_residuals(c: CalibrationPlots) -> Figure:
 
 
 def draw_errors(goals: Sequence[GoalPlots], tolerance_px: float | None) -> Figure:
-    """Error over time on a logarithmic axis, one panel a goal: a straight line is exponential decay."""
+    """Error over time on a logarithmic axis, one panel per goal: a straight line is exponential decay."""
     figure = _figure(4.2 * len(goals), 3.0)
     axes = np.ravel(figure.subplots(1, len(goals), squeeze=False, sharey=True))
     for axis, goal in zip(axes, goals, strict=True):
@@ -519,7 +518,7 @@ def draw_errors(goals: Sequence[GoalPlots], tolerance_px: float | None) -> Figur
 
 
 def draw_velocities(goals: Sequence[GoalPlots], joints: Sequence[str], limits: FloatArray | None) -> Figure:
-    """Joint velocities over time, one panel a goal; limits dashed where all joints share one."""
+    """Joint velocities over time, one panel per goal; limits dashed if all joints share one."""
     figure = _figure(4.2 * len(goals), 3.0)
     axes = np.ravel(figure.subplots(1, len(goals), squeeze=False, sharey=True))
     shared = limits is not None and len(limits) > 0 and bool(np.allclose(limits, limits[0]))
@@ -534,7 +533,7 @@ def draw_velocities(goals: Sequence[GoalPlots], joints: Sequence[str], limits: F
             )
         if shared and limits is not None:
             largest = np.abs(goal.velocities).max(initial=0.0)
-            if largest > 0.3 * limits[0]:  # else the limit would flatten the curves
+            if largest > 0.3 * limits[0]:  # otherwise the limit would flatten the curves
                 for bound in (-limits[0], limits[0]):
                     axis.axhline(bound, color="0.4", linewidth=0.8, linestyle="--")
         axis.set_title(f"{goal.name} · {goal.law}", fontsize=9)
@@ -548,8 +547,7 @@ def draw_velocities(goals: Sequence[GoalPlots], joints: Sequence[str], limits: F
 
 
 def draw_paths(goals: Sequence[GoalPlots]) -> Figure:
-    """Path of the centre: one row a goal; two projections with the straight line, and the distance from
-    it."""
+    """Path of the centre: one row per goal; two projections with the straight line, and the distance from it."""
     figure = _figure(11.0, 2.9 * len(goals))
     rows = figure.subplots(len(goals), 3, squeeze=False)
     for row, goal in zip(rows, goals, strict=True):
@@ -575,7 +573,7 @@ def draw_paths(goals: Sequence[GoalPlots]) -> Figure:
 
 
 def draw_goal_tracks(goals: Sequence[GoalPlots]) -> Figure:
-    """Marker tracks of each goal in each image: a dot where a track begins, a cross where it ends."""
+    """Marker tracks of each goal in each image: a dot at the start of a track, a cross at its end."""
     names = list(dict.fromkeys(name for goal in goals for name in goal.tracks))
     figure = _figure(4.4 * len(names), 3.5 * len(goals))
     rows = figure.subplots(len(goals), len(names), squeeze=False)
@@ -646,7 +644,7 @@ class CalibrationPlots:
 
     ``pixels`` and ``residuals`` (cameras, stops, markers, 2) [px]; ``joint`` (stops,) is the index of the
     joint that moved, -1 for a stop that belongs to none; ``sizes`` (cameras, 2) image width and height [px].
-    ``sigma_px``: the noise [px] per coordinate that residuals are held against, or None. ``figures``: further
+    ``sigma_px``: expected noise [px] per coordinate, to which residuals are compared, or None. ``figures``: further
     lines of the table, name to value.
     """
 
@@ -665,11 +663,11 @@ class CalibrationPlots:
 
 @dataclass(frozen=True)
 class GoalPlots:
-    """Data of one goal. ``times_s`` (t,), ``error_px`` (t,) NaN where unknown, ``velocities`` (t, joints) [rad/s or
+    """Data of one goal. ``times_s`` (t,), ``error_px`` (t,) NaN if unknown, ``velocities`` (t, joints) [rad/s or
     m/s].
 
     ``path_m`` (p, 3) of the centre and ``line_m`` (2, 3), start and end of its straight line [m]. ``gain``
-    [1/s] draws the exponential that the law promises. ``tracks`` maps a camera's name to pixels (t', markers,
+    [1/s] draws the exponential decay expected of the law. ``tracks`` maps a camera's name to pixels (t', markers,
     2) [px].
     """
 
@@ -696,7 +694,7 @@ class GoalPlots:
 class ReportData:
     """All data of one report. ``facts``: lines of the last table (seed, loop, versions), name to value.
 
-    ``velocity_limits`` (joints,) [rad/s or m/s] or None; ``tolerance_px``: what counts as reached.
+    ``velocity_limits`` (joints,) [rad/s or m/s] or None; ``tolerance_px``: error at which a goal counts as reached.
     """
 
     title: str
@@ -710,7 +708,7 @@ class ReportData:
 
 
 def check_shapes(data: ReportData) -> None:
-    """Raise ValueError naming the array whose shape does not fit the rest."""
+    """Raise ValueError that names the array whose shape does not fit the others."""
     n = len(data.joints)
     if data.velocity_limits is not None:
         _expect("velocity_limits", data.velocity_limits, (n,))

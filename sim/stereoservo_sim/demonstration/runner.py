@@ -118,7 +118,7 @@ def conduct_lockstep(
 def _shown(
     cell_path: Path, out: Path, goals: Sequence[ShownGoal] | None, stage: DemonstrationProgress
 ) -> tuple[CellFile, SimulatedCell, Conveyor | None, Sequence[ShownGoal], Path]:
-    """A cell with its truth, its conveyor, the goals that it is shown, and the place of a recording, which is free."""
+    """A cell with its ground truth, its conveyor, the goals to be taught, and an unused path for the recording."""
     cell = load_cell_file(cell_path)
     truth, conveyor, recording = true_cell(cell, cell_path.parent), conveyor_of(cell), out / "flight.mcap"
     for text in truth.robot.notes:
@@ -153,7 +153,7 @@ def conduct_live(
     stage: DemonstrationProgress,
     goals: Sequence[ShownGoal] | None = None,
 ) -> Demonstration:
-    """Run with real processes: a daemon in directories of its own, and a client over zenoh. ``goals``: by default those
+    """Run with real processes: a daemon in directories of its own, and a zenoh client. ``goals``: by default those
     of the arm.
     """
     cell, truth, conveyor, goals, recording = _shown(cell_path, out, goals, stage)
@@ -220,23 +220,23 @@ def _emulate_cameras(ends: ExitStack, cell_path: Path, scratch: Path, out: Path,
 
 
 # -- the live demonstrator -----------------------------------------------------------------------------------
-# The demonstration with real processes: a daemon, and a client over zenoh.
+# The demonstration with real processes: a daemon, and a zenoh client.
 
 
 LOOK_EVERY_S = 2.0
 RECENT_EVENTS = 50
 LOOKS = 3
-"""For the event that tells why a cell is held: state and events come by ways of their own."""
+"""Number of checks for the event that states why a cell is held: state and events arrive independently."""
 MOST_HOLDS = 20
 BUSY_COMPUTER = frozenset({"JOINT_STAMP", "LOOP_GAP"})
-"""Codes of the stops of a simulated cell whose computer was busy."""
+"""Codes of stops caused by a busy computer."""
 
 
 class LiveDemonstrator:
     """``scenario.Operator`` as a goal client of a running daemon.
 
-    As an operator would, it resumes an arm that was held or stopped since the computer was busy, ``MOST_HOLDS`` times
-    at most, tells so, and begins anew what a stop ended; any other hold ends what it waits for.
+    As an operator would, it resumes an arm that was held or stopped since the computer was busy, at most ``MOST_HOLDS``
+    times, reports it, and repeats what a stop has ended. Any other hold ends the current wait.
     """
 
     def __init__(
@@ -289,7 +289,7 @@ class LiveDemonstrator:
         return np.array(list(self._client.joints().values()))
 
     def sights(self, frames: int) -> MarkerSights:
-        """What the cameras see, so many frames of each."""
+        """Observations of the cameras, the required number of frames of each."""
         found = SightCollection((camera.name for camera in self._client.info().cameras), frames)
         until_s = time.monotonic() + SIGHT_S
         for message in self._client.watch(features=True):
@@ -302,18 +302,18 @@ class LiveDemonstrator:
         return found.sights
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
-        """Seconds that the goal's plan needs."""
+        """Duration of the goal's plan [s]."""
         plan = self._client.check(self._client.make_goal(target, law=law)).plan
-        assert plan is not None  # a goal of the images is planned
+        assert plan is not None  # a goal in images is planned
         return plan.seconds
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
-        """Execute a goal to its end, under a lease."""
+        """Execute a goal to its end, with a lease."""
         result = self._drive(lambda: self._client.goal(target, law=law, lease_s=2.0, follow_markers=follow)).wait()
         return result.outcome if result.outcome == "reached" else f"{result.outcome}: {result.message}"
 
     def _look(self) -> None:
-        """Every ``LOOK_EVERY_S``: whether the cell is held. Raises ClientError where nobody would resume it."""
+        """Check every ``LOOK_EVERY_S`` whether the cell is held. Raises ClientError if it will not be resumed."""
         if time.monotonic() - self._looked_s < LOOK_EVERY_S:
             return
         self._looked_s = time.monotonic()
@@ -335,7 +335,7 @@ class LiveDemonstrator:
             raise ClientError(f"the cell was held and nobody resumed it: {cause}")
 
     def _goes_on(self, was_busy: bool, cause: str) -> bool:
-        """Whether the cell was resumed, since the computer ``was_busy``, and not too often yet."""
+        """Whether the cell was resumed: if the computer ``was_busy``, and not too often yet."""
         self._holds += was_busy
         if not was_busy or self._holds > MOST_HOLDS:
             return False
@@ -344,7 +344,7 @@ class LiveDemonstrator:
         return True
 
     def _drive(self, send: Callable[[], GoalHandle]) -> GoalHandle:
-        """A goal that has ended, sent anew where a busy computer ended it."""
+        """Run a goal, again if a busy computer ended it."""
         while True:
             handle = send()
             result = handle.wait()
@@ -399,7 +399,7 @@ class LockstepDemonstrator:
         return self._cell.step().status.positions
 
     def sights(self, frames: int) -> MarkerSights:
-        """What the cameras see, so many frames of each; virtual time passes."""
+        """Observations of the cameras, the required number of frames of each; virtual time passes."""
         found = SightCollection((camera.name for camera in self._cell.settings.cameras), frames)
         before = self._cell.on_step
 
@@ -421,7 +421,7 @@ class LockstepDemonstrator:
         return found.sights
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
-        """Seconds that the goal's plan needs."""
+        """Duration of the goal's plan [s]."""
         return self._operator.planned(target, law=law).seconds
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:

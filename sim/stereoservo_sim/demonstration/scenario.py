@@ -1,4 +1,4 @@
-"""Scenario of the demonstration: which goals are taught, by which law each is reached, and in which order."""
+"""Scenario of the demonstration: the goals that are taught, the law that reaches each, and their order."""
 
 from __future__ import annotations
 
@@ -19,22 +19,22 @@ from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 TEACH_FRAMES = 20
 SEEN_FRAMES = 20
-"""Of each camera, whose mean is what was seen."""
+"""Frames of each camera whose mean is the observation."""
 SIGHT_S = 20.0
-"""For so many frames, at most."""
+"""Time limit for these frames."""
 SEEN_PX = 0.3
-"""Deviation of what was seen: markers differ in how their centres are found at different postures."""
-REST_S = 0.4  # after a move, before the cameras are believed
-JUDGE_S = 1.2  # rest after a goal, of which one second is judged
+"""Standard deviation of an observation: errors of marker centres depend on the posture."""
+REST_S = 0.4  # after a move, before observations are used
+JUDGE_S = 1.2  # rest after a goal, of which one second is evaluated
 
 
 @dataclass(frozen=True)
 class ShownGoal:
     """A goal of the demonstration, one of ``arm_goals.goals_of``: the law that reaches it, and the kind of its target.
 
-    ``taught``: by its name, the pixels that were shown. ``displacement``: by what the body has to do from where it is,
-    a projective 4x4 in the model's frame, without a pixel of the goal. ``follows``: it holds on a part that the belt
-    carries.
+    ``taught``: stated by its name, as the recorded pixels. ``displacement``: stated as the body's displacement from its
+    current pose, a projective 4x4 in the model's frame, without pixels of the goal. ``follows``: it continues on a part
+    that the belt carries.
     """
 
     name: str
@@ -48,7 +48,7 @@ GOALS = (
     ShownGoal("roll", "cartesian3"),
     ShownGoal("far", "trajectory", "displacement"),
 )
-"""From home: 29, 180 and 94 degrees of rotation, 0.12, 0.14 and 0.37 m; see ``world``."""
+"""Goals at 29, 180 and 94 degrees of rotation and 0.12, 0.14 and 0.37 m from home; see ``world``."""
 
 
 ON_BELT = (
@@ -56,14 +56,14 @@ ON_BELT = (
     ShownGoal("roll", "cartesian3", follows=True),
     ShownGoal("far", "points", follows=True),
 )
-"""Of the same places, shown on a part that stands and met on parts that the belt carries."""
+"""The same poses, taught on a static part and reached on parts that the belt carries."""
 
 
 def shown_goals(cell: SimulatedCell, *, on_belt: bool = False) -> tuple[ShownGoal, ...]:
     """The goals of a cell's demonstration, with laws that its arm can follow.
 
-    An arm of few freedoms cannot turn a face about its hinge and in its plane, each for itself, as the Cartesian laws
-    do; one that does not reach on a straight way what it reaches takes a law in the images there, too.
+    An arm with few degrees of freedom cannot rotate a face independently about its hinge and in its plane, as the
+    Cartesian laws do. An arm that does not reach its poses on straight paths uses an image-based law there, too.
     """
     robot = cell.robot
     if on_belt:
@@ -85,18 +85,18 @@ class Calibrated:
 
 VisualTarget = TaughtTarget | DisplacementTarget
 MarkerSights = Mapping[str, Mapping[int, Sequence[tuple[float, float]]]]
-"""By camera and marker: raw pixels, one a frame."""
+"""Raw pixels by camera and marker, one per frame."""
 
 
 class SightCollection:
-    """Frames of the ``cameras``, collected until there are ``frames`` of each."""
+    """Collects frames of the ``cameras`` until there are ``frames`` of each."""
 
     def __init__(self, cameras: Iterable[str], frames: int) -> None:
         self.sights: dict[str, dict[int, list[tuple[float, float]]]] = {name: {} for name in cameras}
         self._left = dict.fromkeys(self.sights, frames)
 
     def add(self, camera: str, ids: Iterable[int], pixels: Iterable[tuple[float, float]]) -> None:
-        """A frame."""
+        """Add a frame."""
         if self._left[camera] > 0:
             self._left[camera] -= 1
             for marker, pixel in zip(ids, pixels, strict=True):
@@ -109,14 +109,14 @@ class SightCollection:
 
     @property
     def missing(self) -> str:
-        """Sentence on the frames that did not come in `SIGHT_S`."""
+        """Sentence on the frames that did not arrive in `SIGHT_S`."""
         late = ", ".join(f"{name} {left}" for name, left in self._left.items() if left)
         return f"frames that did not come in {SIGHT_S:g} s, by camera: {late}"
 
 
 class Operator(Protocol):
-    """Protocol of the cell's operator: a client over zenoh, or the same in lockstep. Every call returns when the
-    arm has finished.
+    """Protocol of the cell's operator: a zenoh client, or the same in lockstep. Every call returns when the arm has
+    finished.
     """
 
     def enable(self) -> None: ...
@@ -134,16 +134,17 @@ class Operator(Protocol):
         ...
 
     def sights(self, frames: int) -> MarkerSights:
-        """What the cameras see of the arm at rest, so many frames of each."""
+        """Observations of the arm at rest, the required number of frames of each camera."""
         ...
 
     def planned_s(self, target: VisualTarget, law: LawName) -> float:
-        """Duration of a goal by its plan, without motion."""
+        """Planned duration of a goal, without motion."""
         ...
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
-        """Execute a goal, which goes with the markers to ``follow``; returns its outcome: ``reached`` or what else
-        ended it, with the message.
+        """Execute a goal; with ``follow`` it continues with moving markers. Returns its outcome: ``reached``, or
+        another end
+        with its message.
         """
         ...
 
@@ -158,8 +159,9 @@ def perform(
     goals: Sequence[ShownGoal] = GOALS,
     belt: Belt | None = None,
 ) -> tuple[Calibrated, dict[str, str]]:
-    """Run the whole demonstration, ``goals`` taught at ``configurations`` (n,), those that follow on parts that the
-    ``belt`` carries; returns the calibration and each goal's outcome.
+    """Run the whole demonstration; returns the calibration and each goal's outcome.
+
+    ``goals`` are taught at ``configurations`` (n,); those that follow are executed on parts that the ``belt`` carries.
     """
     operator.enable()
     tell("calibrating: each joint moves alone in view of both cameras")
@@ -197,7 +199,7 @@ def perform(
 
 
 def _met_on_belt(operator: Operator, goal: ShownGoal, model: CellModel, belt: Belt, tell: Callable[[str], None]) -> str:
-    """Go with a part from when the belt sets off until it stands; the outcome."""
+    """Follow a part from the start of the belt until it stops; returns the outcome."""
     belt.put()
     operator.rest(REST_S)
     belt.run()
@@ -210,10 +212,10 @@ def _met_on_belt(operator: Operator, goal: ShownGoal, model: CellModel, belt: Be
 
 
 def joints_by_images(model: CellModel, operator: Operator) -> FloatArray:
-    """Joints (n,) at which the model has the marker body where the cameras see it.
+    """Joints (n,) at which the model's marker body agrees with the observed pixels.
 
-    An arm with play, sag or ripple stands elsewhere than its joints say, and what is shown are pictures. Raises
-    JointAnglesError where no joints explain them.
+    With play, sag or ripple, the encoders differ from the true joint positions, and goals are taught as images. Raises
+    JointAnglesError if no joints explain the pixels.
     """
     sights = operator.sights(SEEN_FRAMES)
     pixels = np.full((len(model.cameras), len(model.marker_ids), 2), np.nan)

@@ -27,11 +27,12 @@ POLL_S = 1.0
 
 
 def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
-    """Simulated cell behind a cell file's cameras: its arm, their mount, lenses, workpiece, by the cell file's names.
+    """Simulated cell of a cell file: its arm, its cameras with mount and lenses, its workpiece, by the file's names.
     ``folder``: of the cell file.
 
-    Cameras of driver ``video`` show what ``[emulate.cameras]`` puts at their address. Raises ValueError where a camera
-    is none of the simulated rig, and where the arm cannot be simulated.
+    Cameras of driver ``video`` show the images of ``[emulate.cameras]`` at their address. Raises ValueError if a camera
+    is
+    not one of the simulated rig, or the arm cannot be simulated.
     """
     options = [_simulated_options(section, cell) for section in cell.camera]
     shown = any(option.get("workpiece", False) for option in options)
@@ -54,8 +55,8 @@ def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
 
 
 def shown_positions(cell: CellFile, truth: SimulatedCell) -> dict[str, FloatArray]:
-    """Positions of the cell's joints (n,) at the demonstration's goals, by name: of the virtual ones of an arm that
-    takes Cartesian velocities.
+    """Positions of the cell's joints (n,) at the demonstration's goals, by name; for an arm with Cartesian velocities,
+    those of its virtual joints.
     """
     goals = goals_of(truth)
     if cell.joints.driver != TwistJointDriver.driver:

@@ -17,7 +17,7 @@ LINES_WAITING = 10_000
 
 
 class EmulationEvent(Protocol):
-    """An event at ``t_ns``: ``place`` is where as data, ``where()`` the same as text."""
+    """An event at ``t_ns``: ``place`` is its location as data, ``where()`` as text."""
 
     @property
     def t_ns(self) -> int: ...
@@ -49,7 +49,7 @@ class OrderedServer(Protocol):
 
 
 class Printer:
-    """Prints lines by a thread of its own, so that a slow or missing reader does not delay the emulation."""
+    """Prints lines in its own thread, so that a slow or missing reader does not delay the emulation."""
 
     def __init__(self, as_json: bool) -> None:
         self.as_json = as_json
@@ -98,7 +98,7 @@ class Console:
         """Print an event. Times are [s] since the server's start."""
         seconds = (event.t_ns - self._server.start_ns) * 1e-9
         if not self._printer.as_json and event.kind == "order":
-            return  # its answer says it
+            return  # its reply reports it
         where = f"{event.where()}: " if event.where() else ""
         self._printer.say(
             event.kind,

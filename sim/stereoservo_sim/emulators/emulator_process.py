@@ -18,7 +18,7 @@ from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
 
 class EmulatorError(Exception):
-    """The emulator did not come up, or ended; carries its output."""
+    """The emulator did not start, or ended; carries its output."""
 
     def __init__(self, message: str, code: int | None, output: str) -> None:
         super().__init__(message)
@@ -30,8 +30,8 @@ class EmulatorProcess:
     """An emulator of a cell's drives or cameras as a child process; a context manager that ends it.
 
     ``cell``: a cell file, or the name of a shipped cell. ``what``: ``drives`` or ``cameras``. ``options``: further ones
-    of the command. ``log``: file that takes its stderr (default: inherited). ``events``: what it reported so far,
-    oldest first, times in ``t_ns``. It ends with this process. Start it from a thread that lives as long.
+    of the command. ``log``: file for its stderr (default: inherited). ``events``: those reported so far, oldest first,
+    times in ``t_ns``. It ends with this process; start it from a thread that lives at least as long.
     """
 
     def __init__(

@@ -24,11 +24,11 @@ _TIME = re.compile(r"(\d+(?:\.\d*)?|\.\d+)(us|ms|s)")
 
 
 class EmulationError(Exception):
-    """A cell's hardware cannot be emulated as asked; the text lists what is valid."""
+    """A cell's hardware cannot be emulated as requested; the text lists what is valid."""
 
 
 class FaultCommandError(ValueError):
-    """A fault command cannot be parsed or carried out; the text lists what is valid."""
+    """A fault command cannot be parsed or executed; the text lists what is valid."""
 
 
 class _VerbCommand(msgspec.Struct, frozen=True):
@@ -38,7 +38,7 @@ class _VerbCommand(msgspec.Struct, frozen=True):
 class FaultCommand(_VerbCommand, frozen=True, kw_only=True):
     """A parsed command; each emulator adds the fields of its arguments.
 
-    ``at_ns``: when, after the emulator's start; None: at once. ``for_ns``: it is taken back after that time; 0: never.
+    ``at_ns``: time after the emulator's start; None: at once. ``for_ns``: it is undone after that time; 0: never.
     """
 
     at_ns: int | None = None
@@ -48,13 +48,13 @@ class FaultCommand(_VerbCommand, frozen=True, kw_only=True):
 Command = TypeVar("Command", bound=FaultCommand)
 Undo = Callable[[], None]
 Answer = str | tuple[str, Undo]
-"""What an action answers, with what takes it back where it can be taken back."""
+"""Reply of an action, with its undo if there is one."""
 
 
 class Word:
     """One argument of a command: its parser, and its default.
 
-    ``read`` gives the command's fields from the word and raises FaultCommandError. ``missing``: the error's text; None:
+    ``read`` returns the command's fields from the word; raises FaultCommandError. ``missing``: the error's text; None:
     the word is optional and the fields are ``default``.
     """
 
@@ -73,10 +73,10 @@ class Word:
 class Verb:
     """A verb of an emulator's fault commands.
 
-    ``act(emulator, command)`` carries it out. ``lasting``: ``for TIME`` may follow; its ``act`` then gives an undo.
-    ``fixed``: fields that no word sets. ``prepare`` rewrites the words before they are read; ``parse``, where given,
+    ``act(emulator, command)`` executes it. ``lasting``: ``for TIME`` may follow; its ``act`` then returns an undo.
+    ``fixed``: fields that no word sets. ``prepare`` rewrites the words before they are read; ``parse``, if given,
     replaces ``words``. ``check`` raises FaultCommandError for words that do not fit each other. ``logged``: whether it
-    goes into the log.
+    is logged.
     """
 
     usage: str
@@ -108,8 +108,8 @@ class Verb:
 
 
 class FaultLanguage(Generic[Command]):
-    """The verbs of an emulator, and the type of its commands. ``example`` (a command that may last) and ``note``
-    appear in the help.
+    """The verbs of an emulator, and the type of its commands. ``example`` (a command that may last) and ``note`` appear
+    in the help.
     """
 
     def __init__(self, command: type[Command], verbs: Mapping[str, Verb], *, example: str, note: str = "") -> None:
@@ -177,8 +177,8 @@ class FaultLog(Protocol):
 class FaultEngine(Generic[Command]):
     """Executes the fault commands of one emulator, now or when due, undoes them in time, and logs them.
 
-    ``start_ns``: what the times of commands count from. ``check`` raises FaultCommandError where a command names what
-    is not there. ``guard`` is held while something is done or taken back.
+    ``start_ns``: zero of the commands' times. ``check`` raises FaultCommandError if a command names something that does
+    not exist. ``guard`` is held during an action or its undo.
     """
 
     def __init__(
@@ -208,7 +208,7 @@ class FaultEngine(Generic[Command]):
         return command
 
     def postpone(self, command: Command, now_ns: int) -> str | None:
-        """Schedule a command of the future and return the reply; None where it is due now."""
+        """Schedule a future command and return the reply; None if it is due now."""
         if command.at_ns is None or self._start_ns + command.at_ns <= now_ns:
             return None
         self._schedule(self._start_ns + command.at_ns, command, None)
@@ -242,7 +242,7 @@ class FaultEngine(Generic[Command]):
     def advance(self, now_ns: int) -> bool:
         """Execute or undo the first command that is due by ``now_ns``; returns whether there was one.
 
-        A scheduled command that cannot be done any more is logged as refused.
+        A scheduled command that can no longer be executed is logged as refused.
         """
         with self._lock:
             if not self._waiting or self._waiting[0][0] > now_ns:
@@ -265,11 +265,11 @@ class FaultEngine(Generic[Command]):
             heapq.heappush(self._waiting, (t_ns, self._count, command, undo))
 
 
-# -- words that every language has ------------------------------------------------------------------------------------
+# -- words common to all languages ------------------------------------------------------------------------------------
 
 
 def at_most(words: list[str], count: int) -> None:
-    """Raise FaultCommandError where there are more than ``count`` words."""
+    """Raise FaultCommandError if there are more than ``count`` words."""
     if len(words) > count:
         raise FaultCommandError(f"{' '.join(words[count:])!r} is too much")
 

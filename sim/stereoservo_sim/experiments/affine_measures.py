@@ -23,7 +23,7 @@ from stereoservo_sim.experiments.figures import draw_medians
 from stereoservo_sim.world.camera_rig import StereoRig, project, stereo_rig
 
 FOCAL_PX = 1530.0
-"""Of both cameras: the thesis's own rig in table 5.2 (1503 to 1540 px)."""
+"""Focal length of both cameras: the thesis's own rig in table 5.2 (1503 to 1540 px)."""
 IMAGE_SIZE = (512, 512)
 """[px]: twice the principal point of table 5.2 (250 to 260 px)."""
 
@@ -35,7 +35,7 @@ EPIPOLAR_ASSUMED = "the epipolar geometry is known (rigid stereo, chapter 2), ex
 
 
 def converging_rig(distance: float, baseline: float = 0.2) -> StereoRig:
-    """Two cameras of table 5.2, ``baseline`` [m] apart, that look at a point ``distance`` [m] ahead."""
+    """Two cameras of table 5.2, ``baseline`` [m] apart, aimed at a point ``distance`` [m] ahead."""
     return stereo_rig(
         np.eye(4),
         baseline=baseline,
@@ -62,7 +62,7 @@ def fundamental_of(rig: StereoRig) -> FloatArray:
 
 
 def projective_cameras(F: FloatArray, pixels: FloatArray) -> FloatArray:
-    """Cameras (2, 3, 4) of the canonical projective frame, matches ``pixels`` (2, n, 2) before both."""
+    """Cameras (2, 3, 4) of the canonical projective frame, ``pixels`` (2, n, 2) being matches in both."""
     return np.stack(canonical_pair(F, *IMAGE_SIZE, left=pixels[0], right=pixels[1]))
 
 
@@ -72,22 +72,23 @@ def upgrade(plane: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def plane_at_infinity_of(points: FloatArray, X: FloatArray) -> FloatArray:
-    """Plane at infinity (4,), unit norm, of exact projective points (n, 4) of a scene X (n, 3): ``hᵀM`` is what the
-    map to X divides by.
+    """Plane at infinity (4,), unit norm, of exact projective points (n, 4) of a scene X (n, 3): ``hᵀM`` is the divisor
+    of
+    the map to X.
     """
     plane = homography_from_points(points, to_homogeneous(X))[3]
     return np.asarray(plane / np.linalg.norm(plane))
 
 
 def distance_error(N: FloatArray, X: FloatArray) -> float:
-    """``e_D`` [mm]: mean distance of X (n, 3) from N (n, 3) under the affinity that fits best (3.42), (3.43)."""
+    """``e_D`` [mm]: mean distance of X (n, 3) from N (n, 3) under the best-fitting affinity (3.42), (3.43)."""
     design = to_homogeneous(N)
     fit = np.linalg.lstsq(design, X, rcond=None)[0]
     return float(1e3 * np.linalg.norm(X - design @ fit, axis=1).mean())
 
 
 def collinear_triplets(X: FloatArray) -> IntArray:
-    """Every three collinear points (t, 3) of X (n, 3), the middle one second."""
+    """All collinear triplets (t, 3) of points of X (n, 3), the middle one second."""
     found = []
     for triplet in combinations(range(len(X)), 3):
         sides = [np.linalg.norm(X[triplet[i]] - X[triplet[j]]) for i, j in ((1, 2), (0, 2), (0, 1))]
@@ -120,8 +121,9 @@ class Bound:
 
 
 def cramer_rao(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) -> Bound:
-    """Of points X (n, 3) [m] seen at rest and after translations ``shifts`` (s, 3) [m] with noise ``sigma`` [px], the
-    cameras known up to a projective frame, points and motions unknown.
+    """Bound for points X (n, 3) [m] seen at rest and after translations ``shifts`` (s, 3) [m] with noise ``sigma``
+    [px],
+    with cameras known up to a projective frame, and unknown points and motions.
     """
     P = np.array([camera.P for camera in rig.cameras])
     points = to_homogeneous(X)
@@ -145,10 +147,10 @@ def cramer_rao(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) 
 
 
 def cramer_rao_estimated(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) -> Bound:
-    """As `cramer_rao`, with the second camera unknown as well: what is left when F comes from the same images.
+    """As `cramer_rao`, with the second camera unknown as well: the bound if F is estimated from the same images.
 
     ``plane`` is (3n + 3, 3n + 3) here: of the noise-free images' structure in the estimated cameras, points first, and
-    the plane, since both move with the cameras.
+    the plane, since both change with the cameras.
     """
     P = np.array([camera.P for camera in rig.cameras])
     points = to_homogeneous(X)
@@ -166,7 +168,7 @@ def cramer_rao_estimated(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigm
     J[:, :, 3 * n : 3 * n + q], J[:, :, 3 * n + q :] = at.motion, by_camera
     flat = J.reshape(n * rows, -1)
     size = np.linalg.norm(flat, axis=0)
-    # Five directions stay free, of the projective frame that keeps the first camera, and of the second one's scale.
+    # Five directions remain free: of the projective frame that keeps the first camera, and of the second one's scale.
     values, vectors = np.linalg.eigh((flat / size).T @ (flat / size))
     root = vectors[:, FRAME:] / np.sqrt(values[FRAME:]) / size[:, None]
     of_camera = root[3 * n + q :]
@@ -180,7 +182,7 @@ def cramer_rao_estimated(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigm
 
 
 FRAME = 5
-"""Freedoms of a projective frame that has one camera given, with the other's scale."""
+"""Degrees of freedom of a projective frame with one camera given, with the other's scale."""
 
 
 def _second_camera_slopes(P: FloatArray, moved: FloatArray, sigma: float) -> FloatArray:
@@ -215,7 +217,7 @@ def expected_errors(
     triplets: IntArray | None = None,
     exact: FloatArray | None = None,
 ) -> tuple[float, float | None]:
-    """Means of ``e_D`` and ``e_Q`` [mm], to first order, of unbiased Gaussian estimates of these covariances.
+    """Means of ``e_D`` and ``e_Q`` [mm], to first order, of unbiased Gaussian estimates with these covariances.
 
     ``plane`` (3, 3) alone: noise-free structure, upgraded by the estimated plane. ``joint`` (3n + 3, 3n + 3):
     structure and plane of one estimate. ``e_Q`` takes lengths in the affine frame, which shears off-line errors
@@ -272,14 +274,14 @@ def answer_of(rows: list[dict[str, Any]], thesis: dict[str, Any], assumptions: l
 
 
 def rows_of(rows: list[dict[str, Any]], measure: str, **wanted: Any) -> list[dict[str, Any]]:
-    """Rows with these entries whose ``measure`` any seed has given."""
+    """Rows with these entries for which any seed has a value of ``measure``."""
     return [r for r in rows if r[measure]["mean"] and all(r[key] == value for key, value in wanted.items())]
 
 
 def draw_errors(
     axis: Axes, rows: list[dict[str, Any]], across: str, measure: str, style: str, colour: str, label: str
 ) -> None:
-    """Draw medians of a ``measure`` of the rows with their spread, and its bound dashed where they have one."""
+    """Draw medians of a ``measure`` of the rows with their spread, and its bound dashed if there is one."""
     if not rows:
         return
     places = [row[across] for row in rows]

@@ -1,5 +1,5 @@
 """Experiment: the benchmark of thesis 8.7 (180° about the roll axis, face tilted by 60°), and an arm that reaches
-it; figures 8.14 to 8.22, and what the thesis says of them beside ours.
+it; figures 8.14 to 8.22, and the thesis's statements on them beside our results.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def draw_benchmark_180(answer: dict[str, Any]) -> Figures:
 
 
 FAR_OUT_M = 5.0
-"""Beyond any arm's reach."""
+"""Distance beyond any arm's reach."""
 COMES_BACK = (
     "far out each camera still sees the roll that is left, as the tilted face is not symmetric about the axis, so "
     "the law turns and comes back; a run that ends at an arm's reach, as a real one must, has diverged: the thesis "
@@ -75,7 +75,7 @@ COMES_BACK = (
 
 
 def compare_benchmark_180(answer: dict[str, Any]) -> list[Comparison]:
-    """Figs 8.14 to 8.22 in the thesis's words, beside our runs."""
+    """Statements of the thesis on figs 8.14 to 8.22, beside our runs."""
     rows = answer["rows"]
     summary = answer["beside_thesis"]
     return [
@@ -122,7 +122,7 @@ def _classical_compared(rows: list[Curve]) -> list[Comparison]:
 
 
 def _paths_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison]:
-    """Planned ways, and the centre's way beside its line."""
+    """Planned paths, and the path of the centre beside its line."""
     found = []
     for item in summary:
         if "planned" in item:
@@ -243,7 +243,9 @@ def _draw_classical(curves: list[Curve]) -> Figure:
 
 
 def _control_errors(curves: list[Curve]) -> Figure:
-    """Of both Cartesian laws, with and without limited joints; metric beside projective (figs 8.19, 8.20)."""
+    """Control errors of both Cartesian laws, with and without limited joints; metric beside projective (figs 8.19,
+    8.20).
+    """
     figure = picture(11, 4.2)
     axes = figure.subplots(1, 3)
     panels = (
@@ -310,17 +312,18 @@ def _images_and_joints(curves: list[Curve]) -> Figure:
 
 TILT_DEG, DEPTH_M = 60.0, 1.0
 ASIDE_M = {"centred": 0.0, "aside": 0.15}
-"""Of the plate's middle from the roll axis at the goal: to the side that its face looks away from."""
+"""Distance of the plate's centre from the roll axis at the goal, on the side from which its face is turned away."""
 LIMIT_MARGIN = np.radians(5.0)
 WAY_STEPS = 25
 LARGEST_JOINT_STEP = np.radians(25.0)
-"""Between two samples of the path: beyond it the arm would change its posture."""
+"""Largest step between two samples of the path: a larger one is a change of posture."""
 TRIED_GAIN, TRIED_SEEDS = 1.0, 4
 
 
 def benchmark_task(where: str) -> AlignmentTask:
-    """The task. ``centred``: only the rotation; ``aside``: the plate's centre moves from one side of the axis to
-    the other.
+    """The benchmark's task. ``centred``: only the rotation; ``aside``: the plate's centre moves from one side of the
+    axis
+    to the other.
     """
     goal = translation(ASIDE_M[where], 0.0, DEPTH_M) @ rotation("y", TILT_DEG)
     start = rotation("z", 180.0) @ goal
@@ -338,7 +341,7 @@ def true_path(task: AlignmentTask, profile: Profile = "linear") -> CartesianPath
 def _path(
     basis: FloatArray, A: FloatArray, A_star: FloatArray, camera_centres: FloatArray, profile: Profile
 ) -> CartesianPath:
-    """Of markers from ``A`` (m, 4) to ``A_star`` (m, 4)."""
+    """Path of markers from ``A`` (m, 4) to ``A_star`` (m, 4)."""
     middles = A.mean(axis=0), A_star.mean(axis=0)
     return cartesian_path(decompose(basis, A[FACE], A_star[FACE], *middles, camera_centres), profile)
 
@@ -346,9 +349,9 @@ def _path(
 def known_path(
     knowledge: Knowledge, targets: FloatArray, profile: Profile = "linear"
 ) -> tuple[CartesianPath, FloatArray]:
-    """Cartesian path by a controller's knowledge, towards points ``targets`` (m, 4); and the current points (m, 4).
+    """Cartesian path in a controller's model, towards points ``targets`` (m, 4); and the current points (m, 4).
 
-    Raises ValueError where it does not know the markers' places on the body.
+    Raises ValueError if the markers' positions on the body are unknown.
     """
     if knowledge.points is None:
         raise ValueError("a model that knows the markers' places on the body is needed")
@@ -360,8 +363,9 @@ def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticC
     """RX 90 with its base placed such that it follows the whole Cartesian path of ``task`` within its limits; None
     if not found.
 
-    Configurations at the start are drawn by seed. The Cartesian laws then have to drive it with an exact model, for
-    several seeds of the noise: it decides the sense of half a turn. Home is the configuration nearest to the start in
+    Configurations at the start are drawn by seed. The Cartesian laws must then drive it with an exact model, for
+    several seeds of the noise, which decides the sense of half a turn. Home is the configuration nearest to the start
+    in
     which the plate is at mid-range.
     """
     rng, cell = np.random.default_rng([seed, 90]), rx90_cell()
@@ -392,7 +396,7 @@ def _drives(cell: SyntheticCell, task: AlignmentTask) -> bool:
 
 
 def _follows(inverse: FloatArray, poses: list[FloatArray], q: FloatArray, limits: FloatArray) -> bool:
-    """Whether one posture from ``q`` (6,) follows the flange's poses within the limits."""
+    """Whether the arm follows the flange's poses from ``q`` (6,) in one posture within the limits."""
     for pose in poses[1:]:
         following = _nearest(inverse_kinematics(inverse @ pose, limits), q)
         if following is None or float(np.abs(following - q).max()) > LARGEST_JOINT_STEP:
@@ -406,23 +410,23 @@ def _nearest(found: FloatArray, q: FloatArray) -> FloatArray | None:
 
 
 GAINS = (0.5, 1.0, 2.0, 4.0)
-"""[1/s]"""
+"""Gains [1/s]."""
 GAIN = 0.5
 NOISE_PX = 0.1
 JOINT_SPEED_DEG_S = 5.0
 FITTED = 0.02
-"""Decay is fitted until this share of a component is left."""
+"""Remaining share of a component down to which its decay is fitted."""
 SLOW, FAR_PX = 0.1, 20.0
-"""Share of the gain, and total image error, at which a law counts as stalled."""
+"""Decay rate as a share of the gain, and total image error, at which a law counts as stalled."""
 LEAST_ANGLE = 0.05
-"""[rad] at the start, below which an angle counts as none, and its decay is not fitted."""
+"""Least initial angle [rad] whose decay is fitted."""
 TRAPPED = "translates, shows the back, is trapped, escapes, turns in place showing the back again, converges"
 CLASSICAL = {
     "stereo": ("projective", TRAPPED),
     "stereo-block": ("projective", "diverges while moving towards infinity"),
     "euclidean-points": ("metric", TRAPPED),
 }
-"""The classical laws with the model they need, and what the thesis saw of them."""
+"""The classical laws with the model they need, and the thesis's observations of them."""
 CARTESIAN = ("cartesian3", "cartesian2", "trajectory")
 PLANNED: tuple[tuple[str, Profile], ...] = (("centred", "linear"), ("aside", "linear"), ("aside", "translation-first"))
 THESIS = {
@@ -462,7 +466,7 @@ COMPARED = (
     BenchmarkRun("aside", "free", "cartesian3"),
     BenchmarkRun("aside", "free", "cartesian3", "metric"),
 )
-"""Of fig. 8.20."""
+"""Runs compared in fig. 8.20."""
 
 
 def asked() -> list[BenchmarkRun]:
@@ -520,7 +524,7 @@ def run_benchmark_180(*, seed: int, progress: ProgressCall, runs: list[Benchmark
 def _calibrations(
     runs: list[BenchmarkRun], tasks: dict[str, AlignmentTask], seed: int
 ) -> dict[tuple[str, ArmName, str], TaskCalibration | None]:
-    """Calibrations by scene (of the placed arm), arm and model; None where no placement was found."""
+    """Calibrations by scene (of the placed arm), arm and model; None if no placement was found."""
     free = free_cell()
     known: dict[tuple[str, ArmName, str], TaskCalibration | None] = {
         ("", "free", "projective"): self_calibrated("free", free, NOISE_PX, seed),
@@ -571,7 +575,7 @@ def _row(run: BenchmarkRun, task: AlignmentTask, result: TaskResult, trace: Trac
 
 
 def stalled_s(errors: FloatArray, gain: float, dt_s: float) -> float:
-    """Time [s] for which an image error (k,) [px] that is not small decays at less than a tenth of the gain."""
+    """Time [s] for which a large image error (k,) [px] decays at less than a tenth of the gain."""
     rates = -np.diff(np.log(np.maximum(errors, 1e-9))) / dt_s
     return dt_s * int(((rates < SLOW * gain) & (errors[:-1] > FAR_PX)).sum())
 
@@ -618,7 +622,7 @@ def _planned(scene: str, task: AlignmentTask, calibration: TaskCalibration | Non
     planned = np.array([project_points(knowledge.matrices, points @ path.displacement(s).T)[0] for s in sigmas])
     truth = true_path(task, profile)
     parts = truth.decomposition
-    # Half a turn has two senses: the model's is compared with the nearer.
+    # Half a turn has two senses: the model's path is compared with the nearer one.
     other = CartesianPath(replace(parts, planar=replace(parts.planar, operator=-parts.planar.operator)), profile)
     apart, poses = np.inf, np.zeros((0, 4, 4))
     for sense in (truth, other):

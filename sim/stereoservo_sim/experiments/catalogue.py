@@ -22,12 +22,14 @@ REPRODUCED = (
     "projective-vs-euclidean",
     "mobile-cameras",
 )
-"""Experiments of the thesis, in its order: what ``reproduce all`` runs."""
+"""Experiments of the thesis, in its order, which ``reproduce all`` runs."""
 
 
 class ThesisItem(NamedTuple):
-    """Tables or figures by ``number``, what they show, and the ``experiment`` that has them, or why none has
-    (``instead``)."""
+    """Tables or figures by ``number``, their content, and the ``experiment`` that reproduces them, or the reason for
+    none
+    (``instead``).
+    """
 
     number: str
     shows: str
@@ -62,7 +64,7 @@ CONTENTS = (
     ThesisItem("8.7, 9.3", "projective beside Euclidean modelling", "projective-vs-euclidean"),
     ThesisItem("fig. 9.1", "several, mobile cameras before one tool (further work)", "mobile-cameras"),
 )
-"""In the thesis's order."""
+"""Tables and figures in the thesis's order."""
 
 
 def parse_tags(text: str) -> tuple[int, ...]:
@@ -160,7 +162,7 @@ DECLARED = (
         "every law on three demanding tasks, and a sketch of every kind of goal: docs/goals-and-laws.md"),
 )  # fmt: skip
 EXPERIMENTS = {experiment.name: experiment for experiment in DECLARED}
-"""By name."""
+"""Experiments by name."""
 
 
 def find_experiment(name: str) -> Experiment:

@@ -1,9 +1,9 @@
-"""Experiment: light and exposure that change, through the real detectors: their centres, their stated covariances, and
-goals that are reached meanwhile.
+"""Experiment: detectors under varying light and exposure: their centres, their stated covariances, and
+goals reached meanwhile.
 
-The detectors `dots`, `aruco`, `edges`, and the alignment behind `corners`, look at rendered scenes whose true pixels
-are known, with a prior as the core gives one. Goals are those of an arm before two rendered cameras, in lockstep, with
-the detector `dots`; they are taught and reached while the light changes, and judged by noise-free projections.
+The detectors `dots`, `aruco`, `edges`, and the alignment used by `corners`, are applied to rendered scenes with known
+true pixels, with a prior like the core's. Goals are those of an arm before two rendered cameras, in lockstep, with
+the detector `dots`; they are taught and reached while the light changes, and evaluated on noise-free projections.
 """
 
 from __future__ import annotations
@@ -70,24 +70,25 @@ LIGHTS: dict[str, Lighting] = {
     "dark, x 0.08": Lighting(level=0.08),
 }
 PICTURES, PERIOD_S = 40, 0.15
-"""Of each detector and light; the time from one to the next."""
+"""Number of images of each detector and light; time between them."""
 PRIOR_PX = 0.5
 WRONG_PX = 2.0
 BEYOND = 0.999
-"""Share of good sights whose squared distance in the stated covariance is below its chi-square bound."""
+"""Share of correct observations whose squared distance in the stated covariance is below its chi-square bound."""
 
 
 LIMIT_PX = 0.5
-"""Of the error at a goal that counts as reached truly."""
+"""Largest true error of a goal that counts as truly reached."""
 
 
 Look = tuple[FloatArray, FloatArray, int]
-"""Errors (n, 2) [px] of what was reported, their covariances (n, 2, 2), and how many markers face the camera."""
+"""Errors (n, 2) [px] of the reported markers, their covariances (n, 2, 2), and number of markers that face the camera.
+"""
 Looks = Callable[[Lighting, int], Iterator[Look]]
 
 
 def exposed(image: FloatArray, light: Lighting, t_s: float, rng: np.random.Generator) -> ImageArray:
-    """``image`` (h, w) [grey levels] in the light of ``t_s`` [s], with the sensor's noise."""
+    """``image`` (h, w) [grey levels] under the light at ``t_s`` [s], with the sensor's noise."""
     lit = light.lit(np.asarray(image, dtype=np.float32), t_s)
     return np.clip(np.rint(lit + rng.normal(0.0, TAG_NOISE, lit.shape)), 0, 255).astype(np.uint8)
 
@@ -95,7 +96,7 @@ def exposed(image: FloatArray, light: Lighting, t_s: float, rng: np.random.Gener
 def _seen(
     detector: Detector, image: ImageArray, k: int, ids: Any, truth: FloatArray, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Errors (n, 2) and covariances (n, 2, 2) of what ``detector`` reports of markers ``ids`` at ``truth`` (m, 2)."""
+    """Errors (n, 2) and covariances (n, 2, 2) of the markers ``ids`` at ``truth`` (m, 2) reported by ``detector``."""
     stamp = 1_000_000_000 + round(k * PERIOD_S * 1e9)
     off = truth + rng.normal(0.0, PRIOR_PX, truth.shape)
     prior = prior_at("left", stamp, ids, off, PRIOR_PX**2)
@@ -104,7 +105,7 @@ def _seen(
 
 
 def look_at_body(cell: SimulatedCell, detector: Detector, light: Lighting, seed: int) -> Iterator[Look]:
-    """Pictures of the cell's body at postures about its base."""
+    """Images of the cell's body at postures about its base."""
     rng = np.random.default_rng([seed, 20])
     camera = cell.rig.cameras[0]
     renderer = Renderer(cell, camera, RenderSettings(lighting=light))
@@ -116,8 +117,7 @@ def look_at_body(cell: SimulatedCell, detector: Detector, light: Lighting, seed:
 
 
 def facing(cell: SimulatedCell, q: FloatArray, camera: PinholeCamera) -> int:
-    """How many markers, of a solid vertices of faces that look at the camera, there are to see with the arm at ``q``
-    (n,)."""
+    """Number of markers that face the camera (of a solid, vertices of such faces) with the arm at ``q`` (n,)."""
     body, pose, centre = cell.body, cell.body_pose(q), cell.in_world(camera, q).centre
     if not isinstance(body, SolidBody):
         return int(cell.visible(q, camera).sum())
@@ -128,12 +128,12 @@ def facing(cell: SimulatedCell, q: FloatArray, camera: PinholeCamera) -> int:
 
 
 def dots(light: Lighting, seed: int) -> Iterator[Look]:
-    """The demo's plate by the detector `dots`."""
+    """Observations of the demo's plate by the detector `dots`."""
     yield from look_at_body(demo_cell(), DotDetector({}, context_of("left")), light, seed)
 
 
 def edges(light: Lighting, seed: int) -> Iterator[Look]:
-    """The vertices of the cell ``edges`` by the detector `edges`."""
+    """Observations of the vertices of the cell ``edges`` by the detector `edges`."""
     cell = solid_cell()
     start = {"left": dict(zip(cell.body.ids.tolist(), cell.truth_pixels(cell.base)["left"].tolist(), strict=True))}
     with tempfile.TemporaryDirectory(prefix="stereoservo-light-") as folder:
@@ -143,7 +143,7 @@ def edges(light: Lighting, seed: int) -> Iterator[Look]:
 
 
 def aruco(light: Lighting, seed: int) -> Iterator[Look]:
-    """Twelve tags by the detector `aruco`."""
+    """Observations of twelve tags by the detector `aruco`."""
     rng = np.random.default_rng([seed, 21])
     count = TAG_COLUMNS * TAG_ROWS
     options = {"tags": list(range(count)), "dictionary": DICTIONARY}
@@ -155,7 +155,7 @@ def aruco(light: Lighting, seed: int) -> Iterator[Look]:
 
 
 def corners(light: Lighting, seed: int) -> Iterator[Look]:
-    """A texture that is shifted, by the alignment of reference patches that `corners` reports."""
+    """Observations of a shifted texture, by the alignment of reference patches that `corners` reports."""
     rng = np.random.default_rng([seed, 22])
     scene = texture(rng, 480, 2.0)
     steady = exposed(scene, Lighting(), 0.0, rng)
@@ -175,7 +175,9 @@ DETECTORS: dict[str, Looks] = {"dots": dots, "aruco": aruco, "corners": corners,
 
 
 def detector_row(name: str, light_name: str, seed: int) -> dict[str, Any]:
-    """One detector in one light: share found, bias, rms, chi-square a freedom, share beyond its 0.999 bound."""
+    """One detector under one light: share found, bias, rms, chi-square per degree of freedom, share beyond its 0.999
+    bound.
+    """
     errors, squares, shown = [], [], 0
     for error, covariance, count in DETECTORS[name](LIGHTS[light_name], seed):
         shown += count
@@ -216,7 +218,7 @@ def goal_run(light_name: str, seed: int) -> dict[str, Any]:
 def _taught_and_reached(
     cell: LockstepCell, model: CellModel, world: SimulatedCell, goal: FloatArray, seed: int
 ) -> tuple[str, str]:
-    """The goal's end, and what was said of it."""
+    """The goal's end, and its message."""
     try:
         operator = enabled(cell, model, seed, 0.3)
         event, _ = taught_and_reached(operator, world.base, ("cartesian3", "stereo")[seed % 2], goal)
@@ -228,12 +230,14 @@ def _taught_and_reached(
 
 
 def _said(event: Event) -> str:
-    """An event's reasons in words."""
+    """An event's reasons as text."""
     return "; ".join(str(getattr(reason, "message", "") or reason.code) for reason in event.reasons) or event.message
 
 
 def goal_row(light_name: str, seeds: int, seed: int) -> dict[str, Any]:
-    """Goals in one light: reached truly, reached though off, not reached and what was said, verdicts of the watch."""
+    """Goals under one light: truly reached, reached with an error, not reached with the message, verdicts of the
+    monitor.
+    """
     runs = [goal_run(light_name, seed + k) for k in range(seeds)]
     reached = [run for run in runs if run["end"] == "goal_reached"]
     truly = [run["error_px"] for run in reached if run["error_px"] <= LIMIT_PX]
@@ -252,7 +256,7 @@ def goal_row(light_name: str, seeds: int, seed: int) -> dict[str, Any]:
 
 
 def run_changing_light(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """All detectors and ``seeds`` goals in all lights; the JSON object of the command."""
+    """Run all detectors and ``seeds`` goals under all lights; returns the JSON object of the command."""
     pairs = [(name, light) for name in DETECTORS for light in LIGHTS]
     looked = [detector_row(*pairs[k], seed) for k in counted(progress, "detectors and lights", len(pairs))]
     lights = list(LIGHTS)
@@ -277,7 +281,7 @@ def show_changing_light(answer: dict[str, Any], console: Console) -> None:
 
 
 def draw_changing_light(answer: dict[str, Any]) -> Figures:
-    """Chi-square a freedom of each detector over the lights, in order."""
+    """Chi-square per degree of freedom of each detector over the lights, in order."""
     curves = {
         name: [row["chi2_per_freedom"] for row in answer["detectors"] if row["detector"] == name and row["found"]]
         for name in DETECTORS

@@ -17,13 +17,13 @@ from stereoservo_sim.tasks.setting import HOMOGENEOUS_MARKERS
 from stereoservo_sim.tasks.task_file import AlignmentTask
 
 CHUNK = 5
-"""Tasks that a process takes at once."""
+"""Tasks per unit of work of a process."""
 CURVE_POINTS = 150
-"""Of a curve in an answer."""
+"""Largest number of points of a curve in an answer."""
 
 
 class Case(NamedTuple):
-    """How tasks are run: the controller's knowledge and settings."""
+    """How tasks are run: the controller's model and settings."""
 
     calibration: TaskCalibration
     settings: LoopSettings
@@ -35,7 +35,7 @@ _cases: Sequence[Case] = ()
 def results_of(
     cases: Sequence[Case], tasks: Sequence[AlignmentTask], jobs: int, tell: Callable[[int, int], None]
 ) -> list[list[TaskResult]]:
-    """Results of all tasks in all cases, one list a case; ``tell(done, total)`` as they end."""
+    """Results of all tasks in all cases, one list per case; ``tell(done, total)`` is called as they end."""
     total = len(cases) * len(tasks)
     found: list[list[TaskResult]] = [[] for _ in cases]
     tell(0, total)
@@ -46,7 +46,7 @@ def results_of(
                 tell(i * len(tasks) + len(found[i]), total)
         return found
     chunks = [(i, tasks[k : k + CHUNK]) for i in range(len(cases)) for k in range(0, len(tasks), CHUNK)]
-    # A fresh interpreter each: a fork would copy the threads of the progress bar half.
+    # A new interpreter each: a fork would copy the threads of the progress bar in an undefined state.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(jobs, len(chunks)), context, initializer=_start, initargs=(cases,)) as pool:
         futures = [pool.submit(_run_chunk, *chunk) for chunk in chunks]
@@ -85,7 +85,7 @@ def image_errors(poses: FloatArray, goal: FloatArray) -> FloatArray:
 
 
 def path_ratio(poses: FloatArray) -> float:
-    """Length of the markers' image paths over the distance from their start to their end, over all of them."""
+    """Length of the markers' image paths divided by the distance from their start to their end, over all of them."""
     pixels = images(poses)
     walked = np.linalg.norm(np.diff(pixels, axis=0), axis=-1).sum()
     return float(walked / np.linalg.norm(pixels[-1] - pixels[0], axis=-1).sum())
@@ -101,9 +101,9 @@ class Decay(NamedTuple):
 
 
 def decay(errors: FloatArray, dt_s: float, least: float) -> Decay | None:
-    """Fit of errors (k,) from the first one until they have fallen to ``least`` of it; None below four samples.
+    """Fit of errors (k,) from the first one until they have fallen to the share ``least`` of it.
 
-    None, too, where the first is not positive: there is nothing to decay.
+    None for fewer than four samples, or if the first is not positive.
     """
     if not (len(errors) and errors[0] > 0.0 and np.isfinite(errors[0])):
         return None

@@ -1,13 +1,14 @@
-"""Experiments: edges in place of markers, in rendered pictures.
+"""Experiments: edges in place of markers, in rendered images.
 
 ``edge-parts``: a part without markers is aligned by its edges. Every cell differs in light, lens blur, noise, distance
-of the cameras and goal. The arm stands at the goal, which is taught from the pictures, goes away, and is sent back.
-Errors are of noise-free projections of the part's vertices.
+of the cameras and goal. The goal is taught from images with the arm there; then the arm moves away, and back to the
+goal. Errors are of noise-free projections of the part's vertices.
 
-``edge-transfer``: a taught goal is carried over to a workpiece that was moved, by its edges, beside the same by
-markers. The workpiece is rendered twice, as plates with dots and as a solid without markers of the same extent, where
-the goal was taught and where it is sent; the detectors `dots` and `edges` find them. The set-points that each gives are
-compared with the true ones. Edges count as lines alone: no vertex is used as a point; or as both, with a face.
+``edge-transfer``: a taught goal is transferred to a moved workpiece by its edges, beside the same by
+markers. The workpiece is rendered twice, as plates with dots and as a solid without markers of the same extent, at
+its poses when the goal is taught and when it is sent; the detectors `dots` and `edges` find them. The set-points of
+both are compared with the true ones. Edges count as lines alone (no vertex is used as a point); or as both, with a
+face.
 """
 
 from __future__ import annotations
@@ -56,16 +57,16 @@ from stereoservo_sim.world.synthetic import rotation
 from stereoservo_sim.world.workpiece import Moved, Workpiece
 
 LIMIT_PX = 0.5
-"""Of the error of an aligned part."""
+"""Largest error of an aligned part."""
 START_PX = 3.0
-"""How far the start of the part file is off, an axis, at most."""
+"""Largest error per axis of the start in the part file."""
 LEAST_SEEN = 6
-"""Vertices that each camera sees at the goal."""
+"""Least number of vertices that each camera sees at the goal."""
 
 
 @dataclass(frozen=True, eq=False)
 class EdgeSetting:
-    """One cell: how far the cameras are from where the embedded ones are [m], lamp, lens and sensor, goal and law."""
+    """One cell: distances of the cameras from the embedded ones' poses [m], lamp, lens and sensor, goal and law."""
 
     back_m: float
     light: tuple[float, float, float]
@@ -77,7 +78,7 @@ class EdgeSetting:
 
 
 def run_edge_parts(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``seeds`` cells from ``seed`` on; the JSON object of the command."""
+    """Run ``seeds`` cells from ``seed`` on; returns the JSON object of the command."""
     rows = cases(lambda k: align_part(draw_setting(k)), seeds, seed, progress, "cells")
     within = sum(row["error_px"] is not None and row["error_px"] <= LIMIT_PX for row in rows)
     low, high = wilson(within, seeds)
@@ -95,7 +96,7 @@ def run_edge_parts(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str
 
 
 def draw_setting(seed: int) -> EdgeSetting:
-    """A cell of this seed, whose goal shows enough vertices in both cameras."""
+    """A cell of this seed whose goal shows enough vertices in both cameras."""
     rng = np.random.default_rng([seed, 19])
     light = rng.normal(size=3) * 0.4 + np.array(LIGHT)
     back_m, blur, noise = rng.uniform(-0.25, 0.35), rng.uniform(0.5, 1.2), rng.uniform(1.0, 4.0)
@@ -117,7 +118,7 @@ def draw_setting(seed: int) -> EdgeSetting:
 
 
 def true_world(setting: EdgeSetting) -> SimulatedCell:
-    """The simulated cell of a setting, with its cameras where they are."""
+    """The simulated cell of a setting, with its displaced cameras."""
     cell = solid_cell(setting.light)
     moved = Moved((0.0, 0.0, -setting.back_m))
     cameras = tuple(cell.camera(camera.name, 0.0, moved) for camera in cell.rig.cameras)
@@ -160,7 +161,7 @@ def align_part(setting: EdgeSetting) -> dict[str, Any]:
 
 
 def _reached(operator: LockstepOperator, away: FloatArray, law: str) -> tuple[str, str, int]:
-    """The goal's end, in a word and the reason, and how many set-points were taught."""
+    """The goal's end as a word with the reason, and the number of taught set-points."""
     try:
         event, taught = taught_and_reached(operator, away, law)
     except LockstepRefusalError as error:
@@ -172,34 +173,34 @@ def _reached(operator: LockstepOperator, away: FloatArray, law: str) -> tuple[st
 
 
 def draw_edge_parts(answer: dict[str, Any]) -> Figures:
-    """Share of the cells with at most so much error."""
+    """Share of the cells over the error."""
     reached = [row["error_px"] for row in answer["rows"] if row["error_px"] is not None]
     return {"edge-parts": sorted_values({"aligned": reached}, "error at the goal [px]", LIMIT_PX)}
 
 
-# -- goals carried over ----------------------------------------------------------------------------------------
+# -- transferred goals ----------------------------------------------------------------------------------------
 
 ALLOWED = 1.5
-"""Error by edges over that by markers, rms over all cells."""
+"""Allowed ratio of the error by edges to that by markers, rms over all cells."""
 BODY_PX = 0.05
-"""Noise of the body's set-points, which are the same for both."""
+"""Noise of the body's set-points, equal for both."""
 FRAMES = 4
 
 
 FIRST_ID = 500
 FACING_DEG = (6.0, -25.0)
-"""Turns about the plates' x and then y [degrees] that let the solid's top look at the cameras."""
+"""Rotations about the plates' x and then y [degrees] that turn the solid's top to the cameras."""
 HEIGHT = (0.0, 0.045)
-"""Of the solid's base and top, before it is scaled [m]: no face is seen at a grazing angle."""
+"""Heights of the solid's base and top, before scaling [m]: no face is seen at a grazing angle."""
 WAYS = ("markers", "edges", "mixed")
 
 Seen = dict[str, dict[int, tuple[FloatArray, FloatArray]]]
-"""By camera and marker: mean pixel (2,) and its covariance (2, 2)."""
+"""Mean pixel (2,) and its covariance (2, 2) by camera and marker."""
 
 
 @dataclass(frozen=True, eq=False)
 class _CarryScene:
-    """A cell, the poses (4, 4) of its workpiece then and now, and where its arm is away from it."""
+    """A cell, the poses (4, 4) of its workpiece at teaching and now, and the arm's joints away from it."""
 
     cell: SimulatedCell
     then: FloatArray
@@ -208,7 +209,7 @@ class _CarryScene:
 
 
 def run_edge_transfer(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``seeds`` goals from ``seed`` on; the JSON object of the command."""
+    """Run ``seeds`` goals from ``seed`` on; returns the JSON object of the command."""
     rows = cases(carry, seeds, seed, progress, "goals")
     done = [row for row in rows if all(row[f"{way}_px"] is not None for way in WAYS)]
     rms = {way: float(np.sqrt(np.mean([row[f"{way}_px"] ** 2 for row in done]))) for way in WAYS if done}
@@ -231,7 +232,7 @@ def run_edge_transfer(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
 
 
 def carry(seed: int) -> dict[str, Any]:
-    """Errors [px] of a goal's set-points carried over each way, rms; None with the reason where it was refused."""
+    """Errors [px] of a goal's set-points transferred by each method, rms; None with the reason if it was refused."""
     rng = np.random.default_rng([seed, 21])
     plates = workpiece_cell()
     assert plates.workpiece is not None
@@ -297,7 +298,7 @@ def _body_seen(cell: SimulatedCell, q: FloatArray, rng: np.random.Generator) -> 
 
 
 def _carried_truth(cell: SimulatedCell, q: FloatArray, moved: FloatArray) -> dict[str, dict[int, FloatArray]]:
-    """Pixels of the body's markers when it has gone along with the workpiece by ``moved`` (4, 4)."""
+    """Pixels of the body's markers after it has moved with the workpiece by ``moved`` (4, 4)."""
     points = cell.marker_positions(q) @ moved[:3, :3].T + moved[:3, 3]
     return {
         camera.name: dict(zip(cell.body.ids.tolist(), camera.image_of(points)[0], strict=True))
@@ -306,7 +307,7 @@ def _carried_truth(cell: SimulatedCell, q: FloatArray, moved: FloatArray) -> dic
 
 
 def _seen_twice(scene: _CarryScene, rng: np.random.Generator, solid: SolidBody | None) -> tuple[Seen, Seen]:
-    """The workpiece's features when the goal is taught and when it is sent."""
+    """Observations of the workpiece's features when the goal is taught and when it is sent."""
     return _seen(scene, scene.then, rng, solid), _seen(scene, scene.now, rng, solid)
 
 
@@ -348,7 +349,7 @@ def _detector(camera: str, solid: SolidBody | None, start: Mapping[int, tuple[fl
 
 
 def _common_edges(solid: SolidBody, then: Seen, now: Seen) -> tuple[tuple[int, int], ...]:
-    """Edges whose two vertices are seen in both cameras, then and now."""
+    """Edges whose two vertices are seen in both cameras, at teaching and now."""
     both = set.intersection(*(set(seen[name]) for seen in (then, now) for name in seen))
     pairs = {
         (min(a, b), max(a, b))
@@ -367,7 +368,7 @@ def _error(
     target: TaughtTarget,
     truth: Mapping[str, Mapping[int, FloatArray]],
 ) -> tuple[float | None, str]:
-    """Rms error [px] of the set-points, or None and why there are none."""
+    """Rms error [px] of the set-points, or None and the reason for their absence."""
     goal = _taught(model, {name: body[name] | then[name] for name in body})
     observations = {
         name: {
@@ -407,6 +408,6 @@ def _taught(model: CellModel, seen: Seen) -> TaughtGoal:
 
 
 def draw_edge_transfer(answer: dict[str, Any]) -> Figures:
-    """Share of the goals with at most so much error."""
+    """Share of the goals over the error."""
     curves = {way: [row[f"{way}_px"] for row in answer["rows"] if row[f"{way}_px"] is not None] for way in WAYS}
     return {"edge-transfer": sorted_values(curves, "error of the set-points [px]")}

@@ -1,8 +1,8 @@
-"""Experiment: recordings of joints and pixels of random cells, to which a camera's bump, a drifted joint zero, late
-stamps or dropped frames are done, or nothing, examined: what is found, with which onset, and what is falsely told.
+"""Experiment: examination of recordings of joints and pixels of random cells, with an injected fault (a camera's bump,
+a drifted joint zero, late stamps, dropped frames) or none: faults found, their onsets, and false reports.
 
-Three in four are of joints whose axes nobody knows: trial motions, then work; the rest of a hand's poses, at work. A
-third have errors of the joints (ripple and noise of the encoder), or of the poses.
+Three in four have joints with unknown axes: a calibration motion, then work. The others have known hand poses, at
+work. A third have errors of the joints (ripple and noise of the encoder), or of the poses.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ FRAME_S, SAMPLE_S = 1.0 / 15.0, 0.005
 STOPS, WAY_S, REST_S = 9, 0.2, 0.2
 WORK_S = 14.0
 NOISES = (0.03, 0.5)
-"""[px], log-uniform."""
+"""Noise [px], log-uniform."""
 BUMPS, DRIFTS = (2.0, 30.0), (1.0, 10.0)
-"""rms change of the pixels [px], log-uniform."""
+"""Change of the pixels [px], rms, log-uniform."""
 LATE = (0.01, 0.08)
-"""[s]"""
+"""Lateness of the stamps [s]."""
 SHARES: dict[str, float] = {
     "": 0.2,
     "camera_moved": 0.45,
@@ -53,18 +53,18 @@ SHARES: dict[str, float] = {
 ALSO_DROPPED = 0.2
 POSES, IMPERFECT = 0.25, 0.33
 RIPPLE, ENCODER = 1e-4, 3e-5
-"""[rad] Amplitude and deviation of the readings' errors."""
+"""Amplitude and standard deviation of the readings' errors [rad]."""
 POSE_M = 1e-4
-"""[m] Deviation of stated poses; of their turns, [rad], as much."""
+"""Standard deviation of stated poses [m]; of their rotations the same number [rad]."""
 INSIDE = 0.05, 0.95
-"""Share of a recording in which an onset is."""
+"""Range of onsets as a share of a recording."""
 WITHIN = 2
-"""Frames from its true onset within which a cause's is right."""
+"""Largest error in frames of a correct onset."""
 
 
 @dataclass(frozen=True)
 class TrueFault:
-    """What was done: its ``kind`` to a ``subject``, from ``frame`` of each camera on, as delivered (0: throughout)."""
+    """Injected fault: its ``kind`` and ``subject``, from ``frame`` of each camera on, as delivered (0: throughout)."""
 
     kind: Fault
     subject: str
@@ -75,7 +75,7 @@ class TrueFault:
 
 @dataclass
 class _Truth:
-    """A recording in the making: frames at ``times`` (f,), true ``joints`` (f, n) there by camera."""
+    """A recording under construction: frames at ``times`` (f,), true ``joints`` (f, n) at them, by camera."""
 
     cell: SyntheticCell
     sigma: float
@@ -90,7 +90,7 @@ class _Truth:
 
 @dataclass(frozen=True)
 class ExaminedCase:
-    """A generated recording, and what was done to it."""
+    """A generated recording, and its injected faults."""
 
     seed: int
     views: RecordedViews
@@ -122,7 +122,7 @@ def examined_case(seed: int) -> ExaminedCase:
 
 
 def _path(cell: SyntheticCell, rng: np.random.Generator, poses: bool) -> tuple[FloatArray, FloatArray, float]:
-    """Times (j,) and joints (j, n) of trial motions, where joints are recorded, then work; and where that begins."""
+    """Times (j,) and joints (j, n) of the calibration motion, if joints are recorded, then work; and its start."""
     way, rest = round(WAY_S / SAMPLE_S), round(REST_S / SAMPLE_S)
     ease = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, way + 1) / way)
     rows = [cell.home[None]]
@@ -142,7 +142,7 @@ def _path(cell: SyntheticCell, rng: np.random.Generator, poses: bool) -> tuple[F
 
 
 def _recorded(truth: _Truth, kind: str, rng: np.random.Generator) -> RecordedViews:
-    """The recording with one fault of a kind, or none, done to it."""
+    """The recording with one injected fault of a kind, or none."""
     cell, times = truth.cell, truth.times
     frame = int(rng.integers(int(INSIDE[0] * len(times)), int(INSIDE[1] * len(times))))
     camera, joint = int(rng.integers(2)), int(rng.integers(len(cell.home)))
@@ -187,7 +187,7 @@ def _recorded(truth: _Truth, kind: str, rng: np.random.Generator) -> RecordedVie
 def _bumped(
     cell: SyntheticCell, camera: int, size: float, joints: FloatArray, rng: np.random.Generator
 ) -> SyntheticCell:
-    """The cell with a camera turned and shifted so that its pixels change by ``size`` [px] rms."""
+    """The cell with a camera rotated and shifted so that its pixels change by ``size`` [px] rms."""
     axis, shift = rng.normal(size=3), rng.normal(size=3)
     sample = joints[:: max(1, len(joints) // 20)]
     scale = size / float(cell.intrinsics[camera, 0, 0])
@@ -236,7 +236,7 @@ def _views(truth: _Truth, pixels: FloatArray, rng: np.random.Generator) -> Recor
 
 
 def _with_drops(views: RecordedViews, truth: _Truth, rng: np.random.Generator) -> RecordedViews:
-    """The recording without some frames of one camera; onsets are then told in the frames that are left."""
+    """The recording without some frames of one camera; onsets are then stated in the remaining frames."""
     camera, f = int(rng.integers(2)), len(truth.times)
     lost = np.zeros(f, dtype=bool)
     for begin in rng.integers(5, f - 15, int(rng.integers(1, 6))):
@@ -253,9 +253,9 @@ def _with_drops(views: RecordedViews, truth: _Truth, rng: np.random.Generator) -
 
 
 class ExaminedVerdict(msgspec.Struct, frozen=True):
-    """Of a case: ``true`` faults, those ``found``, with the ``late_by`` frames of their onsets, those ``missed``,
-    causes that are ``falsely`` told, and those that are named beside another, as not told apart (``unsure``).
-    ``not_told``: that nothing but dropped frames was examined, since no model could be learnt.
+    """Verdict on a case: ``true`` faults, those ``found``, with the errors ``late_by`` of their onsets in frames, those
+    ``missed``, causes ``falsely`` reported, and those reported beside another as indistinguishable (``unsure``).
+    ``not_told``: only dropped frames were examined, since no model could be learnt.
     """
 
     seed: int
@@ -315,7 +315,7 @@ def _judged(case: ExaminedCase, report: RecordingReport, plain: ExaminedVerdict)
             and fault.subject
         ):
             sizes.append((match.value - fault.size) / match.deviation)
-    # Of joints that do err it is true, and all that can be told of a drift that the model was learnt with.
+    # For erroneous joints it is true, and the most that is known of a drift that was present during calibration.
     drifted = any(fault.kind == "joint_zero" for fault in case.faults)
     left = [cause for cause in left if cause.kind != "joint_errors" or not (case.imperfect or drifted)]
     falsely = tuple(f"{cause.kind} {cause.subject}".strip() for cause in left if cause.kind != "not_learnt")
@@ -327,7 +327,7 @@ def _judged(case: ExaminedCase, report: RecordingReport, plain: ExaminedVerdict)
 
 
 def _frames_apart(case: ExaminedCase, fault: TrueFault, cause: RecordingCause) -> int:
-    """Frames, of the camera that it is told in, by which an onset is later than the true one."""
+    """Delay of an onset after the true one in frames of the camera in which it is stated."""
     assert cause.onset is not None
     if fault.kind != "joint_zero":
         return cause.onset.frame - fault.frame
@@ -337,7 +337,7 @@ def _frames_apart(case: ExaminedCase, fault: TrueFault, cause: RecordingCause) -
 
 
 def _matches(case: ExaminedCase, fault: TrueFault, cause: RecordingCause) -> bool:
-    """Whether a cause is a fault, or says that it cannot tell the two apart."""
+    """Whether a cause is a fault, or is reported as indistinguishable from it."""
     if case.poses and fault.kind == "joint_zero":
         return cause.kind in ("body_moved", "cameras_moved")  # the arm's joints are not recorded
     named = cause.kind == fault.kind and cause.subject == fault.subject
@@ -345,7 +345,7 @@ def _matches(case: ExaminedCase, fault: TrueFault, cause: RecordingCause) -> boo
 
 
 def run_examined_recordings(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1``: found by kind, onsets, and what was falsely told."""
+    """Cases ``seed`` to ``seed + seeds - 1``: found by kind, onsets, and false reports."""
     judged = cases(judged_examination, seeds, seed, progress, "recordings")
     rows = []
     for kind in ("camera_moved", "joint_zero", "late_stamps", "dropped_frames"):
@@ -376,13 +376,13 @@ def run_examined_recordings(seeds: int, seed: int = 0, progress: ProgressCall = 
 
 
 def draw_examined_recordings(answer: dict[str, Any]) -> Figures:
-    """Onsets told, in frames from the true ones."""
+    """Errors of reported onsets in frames."""
     onsets = {"all causes": answer["onsets"]}
     return {"examined_recordings": sorted_values(onsets, "onset from the true one [frames]", WITHIN)}
 
 
 def notes_examined_recordings(answer: dict[str, Any]) -> Iterator[str]:
-    """Every case that is not as it should be."""
+    """Every case with an incorrect result."""
     yield f"faults within the trial motions: {answer['in_trial_motions']}"
     for case in answer["beyond"]:
         yield (

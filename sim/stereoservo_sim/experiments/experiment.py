@@ -1,21 +1,21 @@
-"""Base of the experiments: what each declares, how it is run, and how its answer is shown and compared with the thesis.
+"""Base of the experiments: their declaration, how they are run, and how answers are shown and compared with the thesis.
 
-An experiment is declared once in :mod:`stereoservo_sim.experiments.catalogue`; what it computes is in the module that
-the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module holds
+An experiment is declared once in :mod:`stereoservo_sim.experiments.catalogue`; its computation is in the module that
+the declaration names, loaded when it runs. With NAME the experiment's name in snake case, that module has
 
-- ``run_NAME(*, seed, progress, **options)``: what is found, plain JSON types; or an object,
+- ``run_NAME(*, seed, progress, **options)``: the result, plain JSON types; or an object,
 - ``report_NAME(result)``: the JSON answer of such an object,
 - ``draw_NAME(result)``: the figures by name, those of matplotlib or PNG files' bytes,
-- ``compare_NAME(answer)``: the thesis's figures beside ours, each with a verdict; left out where it gives none,
-- ``notes_NAME(answer)``: lines below the rows, for people; or ``show_NAME(answer, console)``, where `show_rows` does
-  not serve.
+- ``compare_NAME(answer)``: the thesis's figures beside ours, each with a verdict; omitted if the thesis gives none,
+- ``notes_NAME(answer)``: lines below the rows, for people; or ``show_NAME(answer, console)`` if `show_rows` is not
+  suitable.
 
-Every answer has ``experiment``, ``seed``, ``seeds`` where it takes ``--seeds``, ``rows`` and, where the thesis gives
+Every answer has ``experiment``, ``seed``, ``seeds`` if it takes ``--seeds``, ``rows`` and, if the thesis gives
 values, ``thesis``.
 
-A comparison is a figure of ours beside the thesis's, in one verdict word. Our error stands against the thesis's, never
-the bound of an error; a bound is a reason where no estimator can do better. An error is ``better`` or ``worse`` beyond
-a quarter of the thesis's own, else it ``agrees``.
+A comparison is a figure of ours beside the thesis's, with a verdict of one word. Our error is compared with the
+thesis's, never with the bound of an error; a bound is a reason if no estimator can do better. An error is ``better`` or
+``worse`` beyond a quarter of the thesis's own, else it ``agrees``.
 """
 
 from __future__ import annotations
@@ -46,12 +46,13 @@ MEANINGS: dict[Verdict, str] = {
     "not reproduced": "what the thesis saw is not what is seen here",
 }
 MARGIN = 1.25
-"""Of a ratio of errors, to either side, that still agrees."""
+"""Largest ratio of errors, to either side, that still agrees."""
 
 
 class Comparison(NamedTuple):
     """A row: ``item`` of the thesis (table, figure, section), ``what`` is compared, both values as text, the verdict
-    and why it is so."""
+    and its reason.
+    """
 
     item: str
     what: str
@@ -64,7 +65,7 @@ class Comparison(NamedTuple):
 def of_error(
     item: str, what: str, thesis: float | None, ours: float | None, unit: str, why: str = "", lost: str = ""
 ) -> Comparison:
-    """Comparison of two errors [unit]; ``why`` is said where ours is not ``better``, ``lost`` where there is none."""
+    """Comparison of two errors [unit]; ``why``: the reason if ours is not ``better``, ``lost``: if there is none."""
     if thesis is None or ours is None:
         return Comparison(item, what, _text(thesis, unit), _text(ours, unit), "not comparable", lost)
     verdict: Verdict = "agrees"
@@ -78,7 +79,7 @@ def of_error(
 def of_limit(
     item: str, what: str, limit: float, ours: float | None, unit: str, why: str = "", said: str = "below"
 ) -> Comparison:
-    """Comparison of an error of ours [unit] with the limit that the thesis states; ``why`` is said above it."""
+    """Comparison of our error [unit] with the limit stated in the thesis; ``why``: the reason if it is exceeded."""
     if ours is None:
         return Comparison(item, what, f"{said} {_text(limit, unit)}".strip(), "-", "not reproduced", why)
     held = ours <= limit
@@ -93,12 +94,12 @@ def of_limit(
 
 
 def of_statement(item: str, what: str, thesis: str, ours: str, seen: bool, why: str = "") -> Comparison:
-    """Comparison of what the thesis saw with what is ``seen`` here; ``why`` is said where it is not."""
+    """Comparison of an observation of the thesis with ``seen`` here; ``why``: the reason if it is not seen."""
     return Comparison(item, what, thesis, ours, "agrees" if seen else "not reproduced", "" if seen else why)
 
 
 def tally(comparisons: Iterable[Comparison]) -> dict[str, int]:
-    """How many rows have each verdict, in the order of their meanings."""
+    """Number of rows with each verdict, in the order of their meanings."""
     counts = Counter(row.verdict for row in comparisons)
     return {verdict: counts[verdict] for verdict in MEANINGS}
 
@@ -108,11 +109,11 @@ def _text(value: float | None, unit: str) -> str:
 
 
 LISTED, WIDEST = 200, 400
-"""Rows of a table that a person still reads; its characters across at most."""
+"""Largest number of table rows printed for people; largest width in characters."""
 
 
 class ExperimentError(Exception):
-    """Invalid, missing or insufficient input of an experiment. The text holds the cause, the value, what would be
+    """Invalid, missing or insufficient input of an experiment. The text states the cause, the value, and what would be
     valid.
 
     Attributes:
@@ -130,9 +131,9 @@ class ExperimentError(Exception):
 class Option:
     """A command line option of an experiment.
 
-    ``parse`` gives the argument from the given value and raises ExperimentError; ``argument`` is its name in
-    ``run_NAME`` (default: the option's). ``default``: the value where none is given; None: ``run_NAME``'s own.
-    ``required``: the error message where it is missing.
+    ``parse`` returns the argument from the given value and raises ExperimentError; ``argument`` is its name in
+    ``run_NAME`` (default: the option's). ``default``: the value if none is given; None: ``run_NAME``'s own.
+    ``required``: the error message if it is missing.
     """
 
     name: str
@@ -152,9 +153,11 @@ class Option:
 
 @dataclass(frozen=True)
 class Experiment:
-    """An experiment by its ``name`` on the command line. ``seeds``: how many repetitions, each with a seed of its own,
-    by default; 0: it takes no ``--seeds``. ``module``: below ``experiments``. ``own``: its options beside these.
-    ``timed``: the answer has the processor time, ``cpu_s``."""
+    """An experiment by its ``name`` on the command line. ``seeds``: default number of repetitions, each with its own
+    seed;
+    0: it takes no ``--seeds``. ``module``: below ``experiments``. ``own``: its options beside these.
+    ``timed``: the answer has the CPU time, ``cpu_s``.
+    """
 
     name: str
     seeds: int
@@ -165,12 +168,12 @@ class Experiment:
 
     @property
     def options(self) -> tuple[Option, ...]:
-        """All that it takes."""
+        """All its options."""
         repetitions = Option("seeds", int, "how many repetitions", default=self.seeds, least=1)
         return (repetitions, *self.own) if self.seeds else self.own
 
     def run(self, seed: int, given: Mapping[str, Any], progress: ProgressCall) -> Any:
-        """Run with the options that were ``given`` (None: not given). Raises ExperimentError."""
+        """Run with the ``given`` options (None: not given). Raises ExperimentError."""
         taken = {option.name for option in self.options}
         for name, value in given.items():
             if value is not None and name not in taken:
@@ -202,7 +205,7 @@ class Experiment:
         return {f"{name}.png": _png(figure) for name, figure in self._function("draw")(result).items()}
 
     def draw(self, result: Any, folder: Path) -> list[Path]:
-        """Write the figures into ``folder``; their paths."""
+        """Write the figures into ``folder``; returns their paths."""
         folder.mkdir(parents=True, exist_ok=True)
         paths = []
         for name, data in self.figures(result).items():
@@ -221,12 +224,12 @@ class Experiment:
             console.print(f"wrote {path}")
 
     def compare(self, answer: dict[str, Any]) -> list[Comparison]:
-        """The thesis's figures beside those of the answer, a verdict each; empty where it has none."""
+        """The thesis's figures beside those of the answer, with a verdict each; empty if the thesis has none."""
         found: list[Comparison] = self._function("compare", lambda answer: [])(answer)
         return found
 
     def _function(self, what: str, otherwise: Callable[..., Any] | None = None) -> Callable[..., Any]:
-        """A function of the experiment's module, which is imported now. Raises AttributeError."""
+        """A function of the experiment's module, imported now. Raises AttributeError."""
         name = self.name.replace("-", "_")
         module = import_module(f"stereoservo_sim.experiments.{self.module}")
         found: Callable[..., Any] | None = getattr(module, f"{what}_{name}", otherwise)
@@ -236,7 +239,7 @@ class Experiment:
 
 
 def _png(figure: Any) -> bytes:
-    """A figure's file; one that is a file already as it is."""
+    """A figure's file; PNG bytes are returned unchanged."""
     if isinstance(figure, bytes):
         return figure
     data = io.BytesIO()
@@ -247,7 +250,7 @@ def _png(figure: Any) -> bytes:
 def cases(
     judge: Callable[[int], Case], seeds: int, seed: int, progress: ProgressCall, stage: str = "cases"
 ) -> list[Case]:
-    """What ``judge`` finds of seeds ``seed`` to ``seed + seeds - 1``. Raises ValueError for fewer than one."""
+    """Results of ``judge`` for seeds ``seed`` to ``seed + seeds - 1``. Raises ValueError for fewer than one."""
     return crossed(lambda _, k: judge(k), (None,), seeds, seed, progress, stage)[0]
 
 
@@ -259,7 +262,7 @@ def crossed(
     progress: ProgressCall,
     stage: str = "conditions and seeds",
 ) -> list[list[Case]]:
-    """What ``judge`` finds of each of the ``conditions`` and of seeds ``seed`` to ``seed + seeds - 1``: a list for each
+    """Results of ``judge`` for each of the ``conditions`` and seeds ``seed`` to ``seed + seeds - 1``: a list per
     condition. Raises ValueError for fewer than one seed.
     """
     if seeds < 1:
@@ -276,8 +279,8 @@ def crossed(
 def show_rows(answer: dict[str, Any], console: Console) -> None:
     """Print the rows as a table, a spread as its median and the 16th to 84th percentile.
 
-    ``title`` describes the rows where they are not medians over seeds. More than ``LISTED`` rows are left to ``--json``
-    where a summary stands beside the thesis.
+    ``title`` describes the rows if they are not medians over seeds. More than ``LISTED`` rows are left to ``--json``
+    if there is a summary beside the thesis.
     """
     rows = answer["rows"]
     title = answer.get("title") or f"{answer['experiment']}: {answer['seeds']} seeds; medians (16 % to 84 %)"
@@ -305,7 +308,7 @@ def show_table(rows: list[dict[str, Any]], title: str, console: Console) -> None
 def whole_table(
     console: Console, title: str, columns: Mapping[str, Literal["left", "right"]], rows: list[list[str]]
 ) -> None:
-    """Print a table of which nothing is cut off: on a narrow terminal its lines wrap."""
+    """Print a table without truncation: on a narrow terminal its lines wrap."""
     table = Table(title=title, title_justify="left")
     for name, justify in columns.items():
         table.add_column(name, justify=justify, no_wrap=True)
@@ -324,7 +327,7 @@ def whole_table(
 
 
 def show_comparisons(compared: list[Comparison], console: Console) -> None:
-    """Print the thesis's figures beside ours, and how many rows have each verdict."""
+    """Print the thesis's figures beside ours, and the number of rows with each verdict."""
     whole_table(
         console,
         "beside the thesis",

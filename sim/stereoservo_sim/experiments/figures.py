@@ -1,4 +1,4 @@
-"""Figures of the experiments: empty ones, axes in their sizes, and the kinds of drawing that several of them have."""
+"""Figures of the experiments: empty figures, axes in their sizes, and drawings used by several of them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 Figures = dict[str, Figure]
-"""By name of file."""
+"""Figures by file name."""
 
 
 def picture(width: float, height: float, dpi: float = 110.0) -> Figure:
@@ -47,7 +47,7 @@ def draw_images(axis: Axes, pixels: FloatArray, colour: str, label: str) -> None
 
 
 def sorted_values(curves: Mapping[str, list[float]], quantity: str, limit: float | None = None) -> Figure:
-    """What share of the cases has at most so much of a ``quantity``, a curve for each list of values."""
+    """Draw the share of cases up to each value of a ``quantity``, a curve for each list of values."""
     figure = picture(6, 4)
     axes = figure.subplots()
     for name, values in curves.items():
@@ -63,12 +63,12 @@ def sorted_values(curves: Mapping[str, list[float]], quantity: str, limit: float
 def drawing_sorted(
     name: str, key: str, quantity: str, limit: float | None = None
 ) -> Callable[[dict[str, Any]], Figures]:
-    """A ``draw_NAME`` of the curves that an answer has as ``key``, into the file ``name``."""
+    """A ``draw_NAME`` of the curves in an answer's ``key``, into the file ``name``."""
     return lambda answer: {name: sorted_values(answer[key], quantity, limit)}
 
 
 def stacked_bars(rows: Sequence[Mapping[str, Any]], labels: Sequence[str], counts: Sequence[str]) -> Figure:
-    """A bar a row, of its ``counts`` one behind the other."""
+    """A bar per row, of its stacked ``counts``."""
     figure = picture(8, 1.5 + 0.5 * len(rows))
     axis = figure.subplots()
     left = np.zeros(len(rows))
@@ -82,7 +82,7 @@ def stacked_bars(rows: Sequence[Mapping[str, Any]], labels: Sequence[str], count
 
 
 def by_condition(answer: dict[str, Any], condition: str, measure: str) -> dict[str, list[float]]:
-    """A ``measure`` of an answer's ``goals``, of each ``condition`` that it has rows of."""
+    """A ``measure`` of an answer's ``goals``, by each ``condition`` in its rows."""
     return {
         row[condition]: [goal[measure] for goal in answer["goals"] if goal["condition"] == row[condition]]
         for row in answer["rows"]

@@ -58,17 +58,17 @@ from stereoservo_sim.summaries import spread
 from stereoservo_sim.world.camera_rig import StereoRig
 
 DISTANCE = 1.1
-"""[m] of the grid's edge from the rig; not stated in the thesis."""
+"""Distance [m] of the grid's edge from the rig; not stated in the thesis."""
 SIGMA = 0.05
-"""[px], as the thesis states it."""
+"""Noise [px], as stated in the thesis."""
 STEP = 0.02
-"""[m] between stops; not said in the thesis."""
+"""Distance between stops [m]; not stated in the thesis."""
 NOISE_GREY = 2.0
-"""[grey levels], of rendered pictures."""
+"""Noise of rendered images [grey levels]."""
 RENDERED = 2
-"""Sequences of rendered pictures, at most."""
+"""Largest number of sequences of rendered images."""
 CORRUPTED = 5
-"""Of 17 motions, in the rows on rejection: 30 %."""
+"""Number of corrupted motions of 17 (30 %), in the rows on rejection."""
 Values = dict[tuple[Any, int, str, str], list[float]]
 """``e_D`` of each seed, by estimate or noise, number of motions, method and structure."""
 Failed = Counter[tuple[Any, int, str]]
@@ -103,7 +103,7 @@ def scene_shifts() -> FloatArray:
     """Translation of the scene relative to the rig at the 18 stops, (18, 3) [m], from the first one."""
     directions = np.repeat(np.eye(3)[[0, 2, 1]], [5, 6, 6], axis=0)
     path = np.vstack([np.zeros(3), STEP * np.cumsum(directions, axis=0)])
-    # Half of every axis on either side of where the cameras look.
+    # Half of every axis on either side of the point at which the cameras aim.
     return np.asarray(path - STEP * np.array([2.5, 3.0, 3.0]))
 
 
@@ -119,7 +119,7 @@ def cumulative_estimate(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Linear plane at infinity of all motions, non-linear one, and the points of the latter at the first stop.
 
-    Raises GeometryError where the fit fails.
+    Raises GeometryError if the fit fails.
     """
     weighting = image_weighting(cameras, points[0])
     linear = plane_at_infinity_from_stack(Hs, weighting)
@@ -129,7 +129,7 @@ def cumulative_estimate(
 
 
 def run_grid(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``e_D`` of every motion by itself and of the first n together, linear and non-linear."""
+    """``e_D`` of every single motion and of the first n together, linear and non-linear."""
     rig, X = converging_rig(DISTANCE), grid_points()
     scenes = X + scene_shifts()[:, None]
     clean = images_of(rig, scenes)
@@ -166,8 +166,8 @@ def run_grid(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]
 
 
 def by_pictures(rig: StereoRig, rng: np.random.Generator) -> dict[str, Any]:
-    """The same through rendered pictures: ``e_D`` of all motions with the structure of one stereo image and of all, and
-    how far the corners are off [px]. Raises GeometryError.
+    """The same with rendered images: ``e_D`` of all motions with the structure of one stereo image and of all, and
+    errors of the corners [px]. Raises GeometryError.
     """
     X, body = board_points(DISTANCE), boards(DISTANCE)
     found = [
@@ -234,7 +234,7 @@ def _corrupted(
     scenes: FloatArray,
     rng: np.random.Generator,
 ) -> None:
-    """Corruption of five stops: at three a fifth of the matches is wrong, at two the rig rotates by 1° as well."""
+    """Corruption of five stops: at three, a fifth of the matches is wrong; at two, the rig rotates by 1° as well."""
     from scipy.spatial.transform import Rotation
 
     pixels, last = pixels.copy(), len(pixels) - 1
@@ -314,7 +314,7 @@ def compare_grid(answer: dict[str, Any]) -> list[Comparison]:
 
 
 def _compared_pictures(rendered: list[dict[str, Any]], low: float, high: float) -> list[Comparison]:
-    """The errors through rendered pictures, the largest of all sequences."""
+    """The errors with rendered images, the largest of all sequences."""
     rms = max(one["rms_px"] for one in rendered)
     one = max(sequence["one_image_e_d_mm"] for sequence in rendered)
     said = f"through pictures, corners to {rms:.2g} px, F estimated"
@@ -345,16 +345,16 @@ def draw_grid(answer: dict[str, Any]) -> Figures:
 # -- the house -------------------------------------------------------------------------------------------------
 
 SIGMAS = (0.3, 0.5, 1.0)
-"""[px] of the house's interest points."""
+"""Noise of the house's interest points [px]."""
 MOTIONS = (1, 5, 11, 17)
-"""The first n motions of the grid's sequence: one, one axis, two axes, all three."""
+"""Numbers of motions, from the start of the grid's sequence: one, one axis, two axes, all three."""
 POINTS = 60
 LANDMARKS = 80
-"""Interest points that the detector learns of a rendered house, at most."""
+"""Largest number of interest points that the detector learns of a rendered house."""
 WALL, HEIGHT = 0.16, 0.1
-"""[m]"""
+"""Size of the walls, height of the roof [m]."""
 TEXELS, TEXTURE = 256, 4.0
-"""Of a wall's texture along a side, and its finest structure [texels]: some 3 px."""
+"""Texels along a side of a wall's texture, and its finest structure [texels]: some 3 px."""
 HOUSE_THESIS: dict[str, Any] = {
     "figure": "3.7",
     "e_d_mm_below": 1.0,
@@ -374,7 +374,7 @@ HOUSE_ASSUMPTIONS = [
 
 
 def house_points(rng: np.random.Generator, count: int = POINTS) -> FloatArray:
-    """Points (count, 3) [m] on two walls and two sides of a roof, an edge of the house towards the rig."""
+    """Points (count, 3) [m] on two walls and two sides of a roof, with an edge of the house towards the rig."""
     half = np.sqrt(0.5)
     along, high = rng.uniform(0.0, WALL, count), rng.uniform(0.0, HEIGHT, count)
     side, roof = rng.integers(0, 2, count), rng.integers(0, 2, count) == 1
@@ -400,8 +400,8 @@ def house_body(rng: np.random.Generator) -> TexturedBody:
 
 
 def house_by_pictures(seed: int) -> dict[str, Any]:
-    """The same through rendered pictures: ``e_D`` on the grid by the plane at infinity of all motions, how many
-    interest points there were, and how far they are off [px]. Raises DriverError, GeometryError.
+    """The same with rendered images: ``e_D`` on the grid by the plane at infinity of all motions, number of
+    interest points, and their errors [px]. Raises DriverError, GeometryError.
     """
     rng, rig, shifts = np.random.default_rng([seed, 3]), converging_rig(DISTANCE), scene_shifts()
     body = house_body(rng)
@@ -428,7 +428,7 @@ def house_by_pictures(seed: int) -> dict[str, Any]:
 
 def run_house(*, seeds: int, seed: int, progress: ProgressCall, pictures: bool = True) -> dict[str, Any]:
     """``e_D`` of the grid upgraded by the house's plane at infinity, over noise, motions and method, and, with
-    ``pictures``, through rendered ones.
+    ``pictures``, with rendered images.
     """
     rig, X = converging_rig(DISTANCE), grid_points()
     grid_images = images_of(rig, X)
@@ -478,7 +478,7 @@ def run_house(*, seeds: int, seed: int, progress: ProgressCall, pictures: bool =
 
 
 def _expected(X: FloatArray, plane: FloatArray, seen: FloatArray) -> dict[str, float]:
-    """Errors at the bound: of the plane (3, 3) alone, and with the grid's own noise ``seen`` (3n, 3n) beside it."""
+    """Errors at the bound: of the plane (3, 3) alone, and with the grid's own noise ``seen`` (3n, 3n)."""
     n = len(seen)
     joint = np.zeros((n + 3, n + 3))
     joint[:n, :n], joint[n:, n:] = seen, plane
@@ -486,7 +486,7 @@ def _expected(X: FloatArray, plane: FloatArray, seen: FloatArray) -> dict[str, f
 
 
 def compare_house(answer: dict[str, Any]) -> list[Comparison]:
-    """Fig. 3.7 beside our medians, all noises and numbers of motions."""
+    """Fig. 3.7 beside our medians, for all noises and numbers of motions."""
     worst = {
         method: max(
             row["e_d_mm"]["median"] for row in answer["rows"] if (row["method"], row["structure"]) == (method, "full")
@@ -506,8 +506,9 @@ def compare_house(answer: dict[str, Any]) -> list[Comparison]:
 
 
 def draw_house(answer: dict[str, Any]) -> Figures:
-    """``e_D`` on the grid over the number of motions, one curve a noise; and a projective grid beside its upgrade
-    (fig. 3.7)."""
+    """``e_D`` on the grid over the number of motions, one curve per noise; and a projective grid beside its upgrade
+    (fig. 3.7).
+    """
     figure = picture(10, 4.2)
     axes = figure.subplots(1, 2, sharey=True)
     for axis, structure in zip(axes, ("upgrade only", "full"), strict=True):
@@ -523,12 +524,12 @@ def draw_house(answer: dict[str, Any]) -> Figures:
 
 
 def _draw_rectification() -> Figure:
-    """The grid as reconstructed projectively, and upgraded, in coordinates of its own moments."""
+    """The grid as reconstructed projectively, and upgraded, in coordinates normalised by its moments."""
     rig, X = converging_rig(DISTANCE), grid_points()
     images = images_of(rig, X)
     cameras = projective_cameras(fundamental_of(rig), images)
     M = triangulate(cameras, images)
-    # A frame further from affine than the canonical one, so that the projective distortion shows.
+    # A frame farther from affine than the canonical one, to make the projective distortion visible.
     across = (M[:, :1] - M[:, :1].mean()) / np.ptp(M[:, 0])
     skew = M[:, :3] / (M[:, 3:] * (1.0 + 0.8 * across))
     figure = picture(9, 4)

@@ -1,9 +1,9 @@
 """Experiment ``gripper`` (fig. 3.5): affine calibration of a rig from small translations of a gripper, over noise
 and motions.
 
-With these cameras the bound of e_D in full lies above the thesis's figures: a marker triangulated in one image alone is
-about 3 mm off in depth at 1 px. With the structure's own noise taken out, the non-linear estimate stands at the bound
-and below the thesis's figures with 12 motions; with four the bound at 2 px is about 0.5 mm, the thesis's figure.
+With these cameras the full bound of e_D is above the thesis's figures: a marker triangulated in one image alone has a
+depth error of about 3 mm at 1 px. Without the structure's own noise, the non-linear estimate attains the bound
+and is below the thesis's figures with 12 motions; with four the bound at 2 px is about 0.5 mm, the thesis's figure.
 """
 
 from __future__ import annotations
@@ -54,9 +54,9 @@ DISTANCE = 0.9
 SIZE = 0.1
 STEP = 0.02
 MOTIONS = 12
-"""[m], as the thesis gives them."""
+"""Lengths [m], as given in the thesis."""
 SIGMAS = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
-"""[px]"""
+"""Noises [px]."""
 FREE = "non-linear, free points"
 ESTIMATED = "non-linear, free points, epipolar geometry estimated"
 METHODS = {
@@ -90,7 +90,7 @@ Values = dict[tuple[float, int, str, str], list[tuple[float, float]]]
 Bounds = dict[tuple[float, int, str], list[tuple[float, float]]]
 Failed = Counter[tuple[float, int, str]]
 LIMITS = ((0.5, 0.2), (1.0, 0.5), (1.5, 0.5), (2.0, 0.5))
-"""Noise [px] and the thesis's largest e_D [mm] there (3.3.1)."""
+"""Noise [px] and the thesis's largest e_D [mm] at it (3.3.1)."""
 
 
 def markers() -> FloatArray:
@@ -181,7 +181,7 @@ def _bound_of(sigma: float, m: int, method: str, structure: str) -> tuple[float,
 
 
 def _beside_thesis(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Our medians of e_D against the thesis's limits: reached or not, and whether the bound itself exceeds them."""
+    """Our medians of e_D against the thesis's limits: whether they are met, and whether the bound exceeds them."""
     return [
         {
             "sigma_px": row["sigma_px"],
@@ -200,7 +200,7 @@ def _beside_thesis(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def compare_gripper(answer: dict[str, Any]) -> list[Comparison]:
-    """Fig. 3.5 beside our medians, with the epipolar geometry known and estimated."""
+    """Fig. 3.5 beside our medians, with known and estimated epipolar geometry."""
     rows = {(r["sigma_px"], r["motions"], r["method"], r["structure"]): r for r in answer["rows"]}
     sigmas, motions = sorted({key[0] for key in rows}), max(key[1] for key in rows)
     found = []
@@ -253,7 +253,7 @@ def _collect_bounds(
     exact: FloatArray,
     sigmas: tuple[float, ...],
 ) -> None:
-    """Bounds of every noise and number of motions: they grow with sigma in proportion."""
+    """Bounds of every noise and number of motions: they are proportional to sigma."""
     for m in range(1, len(shifts) + 1):
         bound = cramer_rao(rig, X, shifts[:m], 1.0)
         for structure, (d, q) in (
@@ -270,7 +270,7 @@ def _collect_bounds(
 
 
 def _planes(cameras: FloatArray, pixels: FloatArray, sigma: float) -> dict[str, tuple[FloatArray | None, FloatArray]]:
-    """Plane at infinity by each method, and the corresponding structure; None where it fails."""
+    """Plane at infinity by each method, and the corresponding structure; None if it fails."""
     rest = triangulate(cameras, pixels[0])
     weighting = image_weighting(cameras, rest)
     Hs = np.stack([translation_homography(cameras, rest, p) for p in pixels[1:]])
@@ -303,7 +303,7 @@ def _with_estimated_epipolar(
     X: FloatArray,
     triplets: IntArray,
 ) -> None:
-    """The bundle over all motions with F from the matches of the same images."""
+    """Bundle adjustment over all motions with F from the matches of the same images."""
     method, m = ESTIMATED, len(pixels) - 1
     left, right = pixels[:, 0].reshape(-1, 2), pixels[:, 1].reshape(-1, 2)
     try:
@@ -326,7 +326,7 @@ def _pair(N: FloatArray, X: FloatArray, triplets: IntArray) -> tuple[float, floa
 
 
 def draw_gripper(answer: dict[str, Any]) -> Figures:
-    """``e_D`` and ``e_Q`` over noise, one curve a number of motions, linear beside non-linear (fig. 3.5)."""
+    """``e_D`` and ``e_Q`` over noise, one curve per number of motions, linear beside non-linear (fig. 3.5)."""
     found = {}
     for measure, name in (("e_d_mm", "e_D"), ("e_q_mm", "e_Q")):
         figure = found[f"gripper-{name}"] = picture(10, 7)

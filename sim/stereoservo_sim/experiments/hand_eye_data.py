@@ -1,9 +1,9 @@
 """A hand-eye data set: images ``pose##_cam#.jpg`` and the arm's poses in ``ee_poses.csv``, and the ArUco tags in its
 images, their corners registered on the whole printed pattern.
 
-``CORNER_REFINE_SUBPIX`` looks at a few pixels about each corner; on tags of 20 px, with cells of 3 px, it
-pulls the corners inwards (2 % of the side) and is unsure by up to a pixel. Here it is only the start: the
-tag's known black and white cells, seen through a homography and blurred by a Gaussian, are fitted to the grey
+``CORNER_REFINE_SUBPIX`` uses a few pixels about each corner. On tags of 20 px, with cells of 3 px, it
+pulls the corners inwards (2 % of the side), with errors of up to a pixel. Here it is only the start: the
+tag's known black and white cells, imaged by a homography and blurred by a Gaussian, are fitted to the grey
 values of the whole tag.
 """
 
@@ -33,21 +33,21 @@ DICTIONARY = cv2.aruco.DICT_4X4_50
 DICTIONARY_NAME = "DICT_4X4_50"
 TAG_IDS = 50
 STANDING = 100
-"""Marker id from which corners of standing tags count, four a tag."""
+"""First marker id of corners of static tags, four per tag."""
 UNREGISTERED_SIGMA = 0.5
-"""Deviation [px] that is stated for corners that were not registered."""
+"""Standard deviation [px] stated for corners that were not registered."""
 CELLS = 6
-"""Cells along a side: four of data and the black border on both ends."""
+"""Cells along a side: four of data and the black border at both ends."""
 
 
 @dataclass(frozen=True)
 class TagView:
-    """One tag in one image: ``corners`` (4, 2) [px] in the dictionary's order, clockwise from the printed top
-    left.
+    """One tag in one image: ``corners`` (4, 2) [px] in the dictionary's order, clockwise from the printed top left.
 
-    ``sigmas`` (4,) [px]: of the corners, an axis, from the noise of the image. ``start``: the corners of cv2's subpixel
-    refinement. ``registered``: whether the pattern fit was taken.
-    ``blur`` [px] and ``correlation`` of pattern and image are NaN where it was not.
+    ``sigmas`` (4,) [px]: of the corners, per axis, from the noise of the image. ``start``: the corners of cv2's
+    subpixel
+    refinement. ``registered``: whether the pattern fit was accepted; otherwise ``blur`` [px] and ``correlation`` of
+    pattern and image are NaN.
     """
 
     corners: FloatArray
@@ -66,8 +66,7 @@ def tag_cells(tag: int) -> FloatArray:
 
 
 def find_tags(image: GreyImage) -> dict[int, FloatArray]:
-    """Corners ``(4, 2)`` [px] by tag id: cv2's detector with subpixel refinement. Of a repeated id the
-    larger."""
+    """Corners ``(4, 2)`` [px] by tag id: cv2's detector with subpixel refinement. Of a repeated id the larger."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(DICTIONARY), parameters)
@@ -81,9 +80,9 @@ def find_tags(image: GreyImage) -> dict[int, FloatArray]:
 
 
 def register_tag(image: GreyImage, start: FloatArray, cells: FloatArray) -> TagView:
-    """The tag of ``cells`` (n, n) about ``start`` (4, 2) [px], as the detector `aruco` measures it.
+    """The tag of ``cells`` (n, n) about ``start`` (4, 2) [px], as measured by the detector `aruco`.
 
-    Where the fit cannot be believed the start is kept and ``registered`` is False.
+    If the fit is not credible the start is kept and ``registered`` is False.
     """
     start = np.asarray(start, dtype=np.float64)
     compile_kernels()
@@ -100,13 +99,12 @@ def _area(quad: FloatArray) -> float:
 
 
 MEDIAN_OF = 25
-"""Images that enter a median at most: the arm is gone from it, and so is most of the noise."""
+"""Largest number of images in a median, from which the arm and most of the noise are removed."""
 
 
 @dataclass(frozen=True)
 class Flatness:
-    """rms distance [mm] of ``points`` (n, 3) [m] from their best plane; None with the ``reason`` where there
-    is none."""
+    """rms distance [mm] of ``points`` (n, 3) [m] from their best plane; None with the ``reason`` if there is none."""
 
     rms_mm: float | None
     reason: str | None
@@ -122,7 +120,7 @@ def median_image(images: list[GreyImage]) -> GreyImage:
 
 
 def find_standing_tags(image: GreyImage, tags: tuple[int, ...]) -> dict[int, FloatArray]:
-    """Registered corners ``(4, 2)`` [px] of those of ``tags`` that are in a median image."""
+    """Registered corners ``(4, 2)`` [px] of those of ``tags`` found in a median image."""
     found = find_tags(image)
     return {tag: register_tag(image, found[tag], tag_cells(tag)).corners for tag in tags if tag in found}
 
@@ -154,8 +152,7 @@ QUATERNION_TOLERANCE = 1e-2
 
 @dataclass(frozen=True)
 class HandEyeSet:
-    """One set: ``poses`` maps a pose index to ``H_hand_to_base`` (4, 4) [m], ``images`` (pose, camera) to a
-    file."""
+    """One set: ``poses`` maps a pose index to ``H_hand_to_base`` (4, 4) [m], ``images`` (pose, camera) to a file."""
 
     directory: Path
     poses: dict[int, FloatArray]
@@ -168,8 +165,7 @@ class HandEyeSet:
 
 
 def load_hand_eye_set(directory: Path) -> HandEyeSet:
-    """Read the poses and list the images of ``directory``; an image without a pose is an error, the reverse
-    is not.
+    """Read the poses and list the images of ``directory``; an image without a pose is an error, the reverse is not.
 
     Raises ExperimentError: ``data_missing``, ``no_images``, ``csv`` (with line and column), ``pose_missing``.
     """
@@ -193,10 +189,9 @@ def load_hand_eye_set(directory: Path) -> HandEyeSet:
 
 
 def read_poses(path: Path) -> dict[int, FloatArray]:
-    """Pose index -> ``H_hand_to_base`` (4, 4) from a table with the columns of COLUMNS ([m], quaternion
-    xyzw).
+    """Pose index -> ``H_hand_to_base`` (4, 4) from a table with the columns of COLUMNS ([m], quaternion xyzw).
 
-    Lines that are empty or start with ``#`` and a header line that starts with ``index`` are passed over.
+    Empty lines, lines that start with ``#`` and a header line that starts with ``index`` are ignored.
     Raises ExperimentError ``csv`` with line, column and value.
     """
     try:
@@ -220,7 +215,7 @@ def read_poses(path: Path) -> dict[int, FloatArray]:
 
 
 def read_image(path: Path) -> npt.NDArray[np.uint8]:
-    """Grey image ``(height, width)``. Raises ExperimentError ``image`` when the file does not decode."""
+    """Grey image ``(height, width)``. Raises ExperimentError ``image`` if the file cannot be decoded."""
     encoded = np.fromfile(path, dtype=np.uint8) if path.is_file() else np.zeros(0, dtype=np.uint8)
     image = cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE) if encoded.size else None
     if image is None:

@@ -1,7 +1,8 @@
 """Experiment ``homing`` (fig. 4.10): homing of a pan-tilt head from the stereo image of one point.
 
-The bound is that of an estimator which knows the calibration only as well as its own trial motions tell: the noise of
-the current image and of the home image, new in each trial, and that of the calibration, common to all of a seed.
+The bound is that of an estimator whose knowledge of the calibration comes from its own calibration motion: it includes
+the noise of the current image and of the home image, new in each trial, and that of the calibration, common to all of a
+seed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from stereoservo_sim.summaries import spread
 from stereoservo_sim.world.exact_model import exact_model
 
 TRIALS = 35
-"""Fig. 4.10."""
+"""Number of trials, as in fig. 4.10."""
 JOINTS = ("pan", "tilt")
 LIMITS = np.radians([[-90.0, 90.0], [-90.0, 90.0]])
 """Limits of the head, the only prior knowledge of the search."""
@@ -55,7 +56,7 @@ HEADS = {
 @dataclass(frozen=True, eq=False)
 class Homings:
     """Homings from several configurations: ``errors`` (t, 2) [rad] and their common ``covariance`` (2t, 2t); ``images``
-    (t, 2) variances without the calibration; ``ambiguous`` trials with another answer.
+    (t, 2) variances without the calibration; ``ambiguous`` trials with another solution.
     """
 
     errors: FloatArray
@@ -65,7 +66,7 @@ class Homings:
 
     @property
     def normalised(self) -> float:
-        """``eᵀ C⁻¹ e``: chi-square of as many degrees of freedom as there are errors."""
+        """``eᵀ C⁻¹ e``: chi-square with as many degrees of freedom as there are errors."""
         return float(self.errors.ravel() @ np.linalg.solve(self.covariance, self.errors.ravel()))
 
 
@@ -77,8 +78,8 @@ def homings(
     positions: FloatArray,
     pixels: FloatArray,
 ) -> Homings:
-    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), unknown to the estimator, to what
-    ``home_pixels`` (t, c, m, 2) show at ``home`` (2,).
+    """Homing from ``pixels`` (t, c, m, 2) at ``positions`` (t, 2), unknown to the estimator, to the observations
+    ``home_pixels`` (t, c, m, 2) at ``home`` (2,).
 
     Without ``calibration`` the head counts as exactly known. Raises JointAnglesError as `homing_displacement` does.
     """
@@ -170,7 +171,7 @@ def _row(name: str, joint: int, runs: list[Homings]) -> dict[str, Any]:
 
 
 def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
-    """Fig. 4.10: what the thesis stays below, beside the largest error and the rms of the calibrated head."""
+    """Fig. 4.10: the thesis's limit, beside the largest error and the rms of the calibrated head."""
     found = []
     for row in answer["rows"]:
         if row["head"] != "calibrated":
@@ -188,7 +189,7 @@ def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
 
 
 def _normalised(name: str, runs: list[Homings]) -> dict[str, Any]:
-    """Normalised squared errors pooled over trials and seeds, with the interval that the bound allows them."""
+    """Normalised squared errors pooled over trials and seeds, with their interval according to the bound."""
     freedom = sum(run.errors.size for run in runs)
     low, high = (float(value) / freedom for value in chi2.ppf([TAIL, 1.0 - TAIL], freedom))
     mean = sum(run.normalised for run in runs) / freedom
@@ -204,7 +205,7 @@ def _normalised(name: str, runs: list[Homings]) -> dict[str, Any]:
 
 
 def draw_homing(answer: dict[str, Any]) -> Figures:
-    """Errors of the first seed's trials (fig. 4.10), with three deviations of the bound."""
+    """Errors of the first seed's trials (fig. 4.10), with three standard deviations of the bound."""
     figure = picture(8, 5)
     errors = np.array(answer["example"]).reshape(-1, 2)
     rows = {row["joint"]: row for row in answer["rows"] if row["head"] == "calibrated"}

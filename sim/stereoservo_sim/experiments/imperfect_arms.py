@@ -1,21 +1,21 @@
-"""Experiments: goals in pictures for arms that are not perfect, or before a camera that creeps, by the servo core with
-its watch and safety stage.
+"""Experiments: goals in images for imperfect arms, or before a camera that creeps, by the servo core with its model
+monitor and safety stage.
 
-Cells are those of `random_rigs`; a range of seeds is continued with another: ``--seed 100 --seeds 100`` are the cases
-behind ``--seeds 100``.
+Cells are those of `random_rigs`; a range of seeds is continued by another: ``--seed 100 --seeds 100`` are the cases
+after ``--seeds 100``.
 
-``imperfect-arms``: how many goals are reached, and how far those that are called reached are from their set-points in
-truth. Every joint has play, sag, gear ripple and friction at once, and its zero is off by some tenths of a degree since
-the model was learnt. No camera moves. The model is learnt from the same arm's trial motions (``self``), or the true
-one, which states the errors of the readings that the mechanics cause (``exact``).
+``imperfect-arms``: number of goals reached, and true distance of those reported as reached from their set-points.
+Every joint has play, sag, gear ripple and friction at once, and its zero is off by some tenths of a degree since
+calibration. No camera moves. The model is learnt from the same arm's calibration motion (``self``), or the true
+one, which states the errors of the readings caused by the mechanics (``exact``).
 
-``creeping-cameras``: goals are sent, one a minute, while a camera, drawn, turns and moves about drawn axes by
+``creeping-cameras``: goals are sent, one a minute, while a random camera rotates and translates about random axes by
 ``CREEP_PX`` a minute, rms over the markers; or, in a healthy case, none does. Each case has one imperfection of the arm
-or of the stamps, in turn, and a model learnt from the same cell's trial motions. It ends with the first goal that is
-refused, or waits without an end.
+or of the stamps, in turn, and a model learnt from the same cell's calibration motion. It ends with the first goal that
+is refused, or waits without an end.
 
 ``preset-verdicts``: arms with the mechanics of each preset at work for ten virtual minutes, one goal after the other,
-and every verdict of the watch, which has nothing to find, for nothing moves but the arm.
+and every verdict of the model monitor. All verdicts are false, since nothing moves but the arm.
 """
 
 from __future__ import annotations
@@ -48,32 +48,32 @@ from stereoservo_sim.world.synthetic import SyntheticCell
 
 MODELS = ("self", "exact")
 PLAY, SAG = np.deg2rad(1.5), np.deg2rad(1.0)
-"""[rad] The largest of each joint."""
+"""Largest values of each joint [rad]."""
 RIPPLES = (0.02e-3, 1e-3)
-"""[rad], log-uniform."""
+"""Range of the ripple [rad], log-uniform."""
 FRICTION = 0.01
-"""[rad/s] The largest of each joint."""
+"""Largest value of each joint [rad/s]."""
 ZERO_OFFSET = np.deg2rad(0.3)
-"""[rad] The largest of each joint."""
+"""Largest value of each joint [rad]."""
 NOISES = (0.02, 0.2)
-"""[px], log-uniform."""
+"""Range of the noise [px], log-uniform."""
 GOALS = 2
-"""A case."""
+"""Goals per case."""
 SHARE = 0.5
-"""Of the trials' ranges, in which goals are."""
+"""Share of the calibration ranges in which goals are drawn."""
 REST_S = 60.0
-"""After each goal that is called reached."""
+"""Time at rest after each goal that is reported as reached."""
 AVERAGED_S = 1.0
-"""At the beginning of this time, over which the true error is averaged."""
+"""Time over which the true error is averaged, at the beginning of this rest."""
 FALSE = 2.0
-"""Tolerances that the true error of a goal called reached may have."""
+"""Largest true error of a goal reported as reached, in tolerances."""
 DRAWS = 200
 
 
 class GoalVerdict(msgspec.Struct, frozen=True):
     """Outcome of a goal. ``outcome``: ``reached``, ``refused`` before motion, ``held``, ``aborted``. ``error_px``: the
-    true one, ``later_px`` of a minute later; ``reversals`` of commands in this minute. ``codes``, ``verdict``: what the
-    core says. ``zero_load``: joints whose load is too small there to press their links against a flank.
+    true one, ``later_px`` a minute later; ``reversals`` of commands in this minute. ``codes``, ``verdict``: reported by
+    the core. ``zero_load``: joints whose load is too small at the goal to press their links against a flank.
     """
 
     seed: int
@@ -89,7 +89,7 @@ class GoalVerdict(msgspec.Struct, frozen=True):
 
 
 class CaseVerdict(msgspec.Struct, frozen=True):
-    """Outcome of a case: its goals, or the ``code`` and ``message`` for which it has no model."""
+    """Outcome of a case: its goals, or the ``code`` and ``message`` of a failed calibration."""
 
     seed: int
     goals: tuple[GoalVerdict, ...] = ()
@@ -98,7 +98,7 @@ class CaseVerdict(msgspec.Struct, frozen=True):
 
 
 def imperfect_arm(seed: int) -> tuple[RandomCase, Imperfections]:
-    """The rig of ``seed`` and what is not perfect about its arm."""
+    """The rig of ``seed`` and the imperfections of its arm."""
     case = random_case(seed)
     rng = np.random.default_rng([seed, 6])
     n = len(case.cell.home)
@@ -121,7 +121,7 @@ def imperfect_arm(seed: int) -> tuple[RandomCase, Imperfections]:
 
 
 def model_of(case: RandomCase, wrong: Imperfections, kind: str) -> CellModel:
-    """The arm's model, with its zeros as they were. Raises CalibrationError."""
+    """The arm's model, with its zeros as at calibration. Raises CalibrationError."""
     gears = wrong.mechanics
     assert gears is not None
     if kind == "exact":
@@ -136,7 +136,7 @@ def model_of(case: RandomCase, wrong: Imperfections, kind: str) -> CellModel:
 
 
 def learnt_model(case: RandomCase, wrong: Imperfections) -> CellModel:
-    """The model of the arm's own trial motions. Raises CalibrationError."""
+    """The model of the arm's own calibration motion. Raises CalibrationError."""
     assert wrong.mechanics is not None
     return fit_model(simulated_trials(case, wrong.mechanics, wrong.noise_px), epoch=1).model
 
@@ -144,8 +144,8 @@ def learnt_model(case: RandomCase, wrong: Imperfections) -> CellModel:
 def places_in_view(
     case: RandomCase, rng: np.random.Generator, count: int | None, share: float = SHARE, draws: int = DRAWS
 ) -> FloatArray:
-    """Configurations (k, n) of the links, k up to ``count``, with all markers in both images, of so many ``draws`` from
-    a ``share`` of the trials' ranges. Raises CalibrationError for fewer.
+    """Configurations (k, n) of the links, k up to ``count``, with all markers in both images, from ``draws`` draws from
+    a ``share`` of the calibration ranges. Raises CalibrationError for fewer.
     """
     drawn = case.cell.held_out(rng, draws, share)
     found = drawn[case.cell.in_view(drawn, 10.0).all(axis=(0, 2))][:count]
@@ -155,12 +155,12 @@ def places_in_view(
 
 
 def outcome(end: GoalEnd) -> str:
-    """How a goal ended, in a word."""
+    """The end of a goal as a word."""
     return {"goal_reached": "reached", "refused": "refused", "": "held"}.get(end.kind, "aborted")
 
 
 def farthest(shown: FloatArray, wanted: FloatArray) -> float:
-    """Largest distance [px] of markers (c, m, 2) from where they are wanted."""
+    """Largest distance [px] of markers (c, m, 2) from their set-points."""
     return float(np.linalg.norm(shown - wanted, axis=-1).max())
 
 
@@ -200,8 +200,9 @@ def _judged_goal(driven: DrivenCell, seed: int, number: int, place: FloatArray, 
 def run_imperfect_arms(
     seeds: int, seed: int = 0, model: str = "self", progress: ProgressCall = silent
 ) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1``: outcomes with Wilson bounds, every goal that is not reached with what the
-    core says of it, and every one that is falsely called reached.
+    """Cases ``seed`` to ``seed + seeds - 1``: outcomes with Wilson bounds, every goal that is not reached with the
+    core's
+    report, and every goal falsely reported as reached.
 
     Raises ExperimentError for an unknown ``model``.
     """
@@ -243,11 +244,11 @@ def _spread(values: list[float]) -> dict[str, float] | None:
 
 
 draw_imperfect_arms = drawing_sorted("imperfect_arms", "errors_px", "true error [px]", FALSE * TOLERANCE_PX)
-"""True errors of goals called reached, then and a minute later, beside what would be false."""
+"""True errors of goals reported as reached, then and a minute later, beside the limit for false ones."""
 
 
 def notes_imperfect_arms(answer: dict[str, Any]) -> Iterator[str]:
-    """Spreads, and every goal that was lost or falsely called reached."""
+    """Spreads, and every goal that was lost or falsely reported as reached."""
     for name, unit in (("error_px", "px"), ("later_px", "px"), ("seconds", "s")):
         if answer[name] is not None:
             spread = ", ".join(f"{key} {value:.3g}" for key, value in answer[name].items())
@@ -266,30 +267,31 @@ def notes_imperfect_arms(answer: dict[str, Any]) -> Iterator[str]:
 # -- a camera that creeps --------------------------------------------------------------------------------------
 
 KINDS = ("exact", "ripple", "play", "sag", "late")
-"""What is imperfect in the case of seed k: the one at k modulo their number."""
+"""Imperfection in the case of seed k: the one at k modulo their number."""
 CREEP_PX = 0.5
-"""[px a minute] Rms over the markers, at the case's home."""
+"""Creep [px a minute], rms over the markers, at the case's home."""
 TURNED = 0.7
-"""Share of the creep that a rotation makes; a translation makes the rest."""
+"""Share of the creep due to rotation; the rest is due to translation."""
 
 
 CREEP_GOALS = 3
 EVERY_S = 60.0
-"""From one goal to the next."""
+"""Time from one goal to the next."""
 LIMIT_S = 20.0
 CREEP_AVERAGED_S = 0.5
 
 
 CREEP_FALSE = 1.5
-"""Tolerances beside its set-points, in the pictures of cameras that stand, from which on a goal is falsely called
-reached: its tolerance, and the part of it by which cameras may be displaced (`core.sources.progress.SHARE`).
+"""Largest true error in the images of static cameras, in tolerances, of a goal correctly reported as reached: its
+tolerance, and the part of it by which cameras may be displaced (`core.sources.progress.SHARE`).
 """
 
 
 class CreepVerdict(msgspec.Struct, frozen=True):
-    """Outcome of a goal, sent ``minutes`` after the first step: ``outcome`` as the core calls it, ``codes`` and
-    ``verdict`` of the core, the true ``error_px`` in the pictures of cameras that stand, the ``crept_px`` by which the
-    camera's pictures are off there, and how far the body is from its place [mm].
+    """Outcome of a goal, sent ``minutes`` after the first step: ``outcome`` as reported by the core, ``codes`` and
+    ``verdict`` of the core, the true ``error_px`` in the images of static cameras, the camera's displacement
+    ``crept_px``
+    in its images there, and the distance of the body from its goal [mm].
     """
 
     seed: int
@@ -304,7 +306,7 @@ class CreepVerdict(msgspec.Struct, frozen=True):
 
 
 def creeping_case(seed: int) -> tuple[RandomCase, str, Imperfections]:
-    """The rig of ``seed``, what is imperfect about it, and the camera that creeps."""
+    """The rig of ``seed``, its imperfection, and the camera that creeps."""
     case, kind = random_case(seed), KINDS[seed % len(KINDS)]
     rng = np.random.default_rng([seed, 16])
     noise = float(np.exp(rng.uniform(*np.log(NOISES))))
@@ -326,7 +328,7 @@ def creeping_case(seed: int) -> tuple[RandomCase, str, Imperfections]:
 
 
 def drawn_creep(cell: SyntheticCell, rng: np.random.Generator) -> Creep:
-    """A camera, and the direction in which it creeps by ``CREEP_PX`` a minute."""
+    """A random camera, and the direction in which it creeps by ``CREEP_PX`` a minute."""
     camera, directions = int(rng.integers(len(cell.poses))), rng.standard_normal((2, 3))
     sizes = []
     for k, direction in enumerate(directions):
@@ -338,7 +340,7 @@ def drawn_creep(cell: SyntheticCell, rng: np.random.Generator) -> Creep:
 
 
 def _rms(cell: SyntheticCell, creep: Creep, seconds: float, q: FloatArray) -> float:
-    """By how much the pixels of the camera that creeps are off with the arm at ``q`` [px], rms."""
+    """Rms pixel change [px] of the creeping camera with the arm at ``q``."""
     off = creep.moved(cell, seconds).pixels(q[None]) - cell.pixels(q[None])
     return float(np.sqrt((off[creep.camera] ** 2).sum(axis=-1).mean()))
 
@@ -372,8 +374,8 @@ def judged_creep(seed: int, *, creeps: bool, goals: int = CREEP_GOALS) -> list[C
 
 
 def run_creeping_cameras(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1``, with a creeping camera and without: goals called reached and held, with
-    Wilson bounds, and every one of them that is falsely called so.
+    """Cases ``seed`` to ``seed + seeds - 1``, with a creeping camera and without: goals reported as reached and held,
+    with Wilson bounds, and every false report.
     """
     found: dict[bool, list[CreepVerdict]] = {True: [], False: []}
     no_model: Counter[str] = Counter()
@@ -410,11 +412,11 @@ def run_creeping_cameras(seeds: int, seed: int = 0, progress: ProgressCall = sil
 
 
 draw_creeping_cameras = drawing_sorted("creeping_cameras", "errors_px", "true error [px]", CREEP_FALSE * TOLERANCE_PX)
-"""True errors of goals called reached, beside what would be false."""
+"""True errors of goals reported as reached, beside the limit for false ones."""
 
 
 def notes_creeping_cameras(answer: dict[str, Any]) -> Iterator[str]:
-    """Every goal that was falsely called reached or falsely held."""
+    """Every goal that was falsely reported as reached or falsely held."""
     yield f"cases without a model: {answer['no_model']}"
     for kind in ("false", "held"):
         for goal in answer[kind]:
@@ -430,12 +432,12 @@ def notes_creeping_cameras(answer: dict[str, Any]) -> Iterator[str]:
 MINUTES = 10.0
 NOISE_PX = 0.05
 PAUSE_S = 1.0
-"""Between goals."""
+"""Time between goals."""
 
 
 class PresetVerdict(msgspec.Struct, frozen=True):
-    """A case at work with a preset: ``minutes`` of virtual time, how its goals ended, how long [s] those took that were
-    reached, and the ``verdicts`` of the watch. ``code``: why there is no model.
+    """A case at work with a preset: ``minutes`` of virtual time, ends of its goals, durations [s] of those reached, and
+    the ``verdicts`` of the model monitor. ``code``: why there is no model.
     """
 
     seed: int
@@ -498,9 +500,9 @@ def run_preset_verdicts(seeds: int, seed: int = 0, progress: ProgressCall = sile
 
 
 draw_preset_verdicts = drawing_sorted("preset_verdicts", "seconds", "time to the goal [s]")
-"""How long the goals that are reached take, by preset."""
+"""Durations of reached goals, by preset."""
 
 
 def notes_preset_verdicts(answer: dict[str, Any]) -> Iterator[str]:
-    """How the goals ended, by preset."""
+    """Ends of the goals, by preset."""
     return (f"{name}: {ends}" for name, ends in answer["ends"].items())

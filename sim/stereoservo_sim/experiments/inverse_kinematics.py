@@ -1,7 +1,7 @@
 """Experiment: inverse kinematics of all families of arms (thesis 6) on random arms in random projective frames.
 
-The projective solver is given operators and points or displacements; a metric solver that shares nothing with it judges
-whether all solutions are found and how far their joints are off.
+The projective solver is given operators and points or displacements. An independent metric solver determines whether
+all solutions are found, and the errors of their joints.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from stereoservo_sim.progress import ProgressCall, counted
 from stereoservo_sim.world.synthetic import SEVEN_ROWS, dh_link
 
 SEARCH = 400
-"""Starts of the metric search for each pose of an arm without a closed form."""
+"""Number of starts of the metric search for each pose of an arm without a closed form."""
 PUMA_ROWS = ((0, -90, 0), (0.4318, 0, 0.15), (0.0203, -90, 0), (0, 90, 0.4318), (0, -90, 0), (0, 0, 0.05))
 """The PUMA 560's geometry: rows (a [m], alpha [°], d [m])."""
 
 
 @dataclass(frozen=True, eq=False)
 class SingularPose:
-    """Joints (n,) at a singular configuration. ``free``: a joint that the goal leaves free, None where two
-    solutions coincide instead. ``point`` (3,) where the goal is that of a single one.
+    """Joints (n,) at a singular configuration. ``free``: a joint undetermined by the goal, None if two
+    solutions coincide instead. ``point`` (3,) if the goal is that of a single point.
     """
 
     joints: FloatArray
@@ -47,9 +47,12 @@ Judge = Callable[[EuclideanAxes, FloatArray, FloatArray | None, np.random.Genera
 
 @dataclass(frozen=True, eq=False)
 class ArmFamily:
-    """A family of arms. ``axes`` draws an arm; ``judge`` solves poses (N, 4, 4), or what they do to points (N, 3),
-    for an arm: (N, s, n); None of a redundant arm. ``single_point``: whether the goals are those of one point.
-    ``singular`` draws a singular pose. ``bounded``: whether goals 5 m away are out of reach.
+    """A family of arms.
+
+    ``axes`` draws an arm; ``judge`` solves poses (N, 4, 4), or their effect on points (N, 3), for an arm: (N, s, n);
+    None
+    for a redundant arm. ``single_point``: whether the goals are those of one point. ``singular`` draws a singular pose.
+    ``bounded``: whether goals 5 m away are out of reach.
     """
 
     axes: Callable[[np.random.Generator], EuclideanAxes]
@@ -118,7 +121,7 @@ def concurrent(rng: np.random.Generator) -> EuclideanAxes:
 
 
 def square_wrist(rng: np.random.Generator) -> EuclideanAxes:
-    """Wrist with axes 1 and 3 normal to axis 2, so that they can coincide; points anywhere on the axes."""
+    """Wrist with axes 1 and 3 normal to axis 2, so that they can coincide; random points on the axes."""
     w1, centre = unit(rng), _place(rng)
     w2 = np.cross(w1, unit(rng))
     w2 /= np.linalg.norm(w2)
@@ -174,7 +177,7 @@ def _on_axis(axes: EuclideanAxes, j: int, rng: np.random.Generator) -> FloatArra
 
 
 def point_on_first_axis(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """Random joints, and the point that they move onto the first axis: that joint is free."""
+    """Random joints, and the point that they move onto the first axis, so that the first joint is free."""
     q = rng.uniform(-np.pi, np.pi, len(axes.directions))
     outer = axes.part(slice(1, None)).displacements(q[None, 1:])[0]
     return SingularPose(q, 0, (np.linalg.inv(outer) @ np.append(_on_axis(axes, 0, rng), 1.0))[:3])
@@ -200,9 +203,7 @@ def stretched_point(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPo
 
 
 def aligned_wrist(axes: EuclideanAxes, rng: np.random.Generator) -> SingularPose:
-    """Configuration of a square wrist whose outer axes coincide: its first and last joint rotate against each
-    other.
-    """
+    """Configuration of a square wrist whose outer axes coincide: its first and last joint rotate against each other."""
     n = len(axes.directions)
     q = rng.uniform(-np.pi, np.pi, n)
     q[~axes.revolute] *= 0.1
@@ -275,26 +276,26 @@ FAMILIES: dict[str, ArmFamily] = {
     "six revolute, general": ArmFamily(general, _searched, False),
     "seven revolute": ArmFamily(lambda rng: from_rows(SEVEN_ROWS), lambda axes, H, points, rng: None, False),
 }
-"""By the name in the table."""
+"""Families by their name in the table."""
 
 
 # -- the experiment --------------------------------------------------------------------------------------------
 
 POSES = 100
-"""Poses of each family by default."""
+"""Default number of poses of each family."""
 ARMS = 20
-"""Arms, each in its own frame, that share the poses of a family."""
+"""Number of arms, each in its own frame, that share the poses of a family."""
 SAME = 1e-5
-"""Largest difference of joints [rad or m] of a solution found and the metric one."""
+"""Largest joint difference [rad or m] between a found solution and the metric one."""
 SOLVED = 1e-8
 FAR = 5.0
-"""Way [m] by which a goal is moved out of reach."""
+"""Distance [m] by which a goal is moved out of reach."""
 LEAST_DRAWN = 1e-17
 WALK = 0.3
-"""Motion [rad] along a self-motion that has to leave the goal reached."""
+"""Motion [rad] along a self-motion that must keep the goal reached."""
 
 KEPT = 0.05
-"""Motion [rad] along a self-motion of a singular pose that has to leave the goal reached."""
+"""Motion [rad] along a self-motion of a singular pose that must keep the goal reached."""
 
 THESIS = "chapter 6 derives the solutions and prints no figure of their accuracy"
 
@@ -335,7 +336,7 @@ def hide(axes: EuclideanAxes, rng: np.random.Generator) -> Hidden:
 
 
 def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Run every family over ``seeds`` poses, with a tenth as many singular and unreachable ones."""
+    """Run every family over ``seeds`` poses, and a tenth as many singular and unreachable ones."""
     families = list(FAMILIES.items())
     rows = [
         family_row(*families[i], seeds, np.random.default_rng([seed, i]))
@@ -355,7 +356,7 @@ def run_inverse_kinematics(*, seeds: int, seed: int, progress: ProgressCall) -> 
 
 
 def compare_inverse_kinematics(answer: dict[str, Any]) -> list[Comparison]:
-    """Chapter 6: whether every solution of a metric solver is found, a family a row."""
+    """Chapter 6: whether every solution of a metric solver is found, one row per family."""
     found = []
     for row in answer["rows"]:
         metric = row["solutions"] is not None
@@ -432,7 +433,7 @@ def family_row(name: str, family: ArmFamily, poses: int, rng: np.random.Generato
 
 
 def differences(axes: EuclideanAxes, right: FloatArray, joints: FloatArray) -> FloatArray:
-    """Largest difference (s,) [rad or m] of each valid solution (s, n) to the nearest of ``joints`` (r, n)."""
+    """Largest joint difference (s,) [rad or m] of each valid solution (s, n) from the nearest of ``joints`` (r, n)."""
     if not len(joints):
         return np.full(len(right), np.inf)
     apart = right[:, None] - joints[None]
@@ -443,8 +444,8 @@ def differences(axes: EuclideanAxes, right: FloatArray, joints: FloatArray) -> F
 def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
     """Whether the result at a singular pose reaches it and reports the free joint, or is the isolated solution.
 
-    Where a wrist is nearly aligned (``w`` rad from it) before a stretched elbow, the elbow has to move in proportion to
-    ``w`` times the wrist's turn, and the goal is left by the order of the square of that: a continuum to within the
+    If a wrist is nearly aligned (``w`` rad from it) before a stretched elbow, the elbow has to move in proportion to
+    ``w`` times the wrist's rotation, and the goal error is of second order in that: a continuum to within the
     tolerance, if metric kinematics confirms it.
     """
     goal = hidden.axes.displacements(pose.joints[None])[0]
@@ -458,8 +459,8 @@ def singular_handled(pose: SingularPose, hidden: Hidden) -> bool:
 
 
 def kept_along(hidden: Hidden, answer: InverseSolutions, goal: FloatArray, point: FloatArray | None) -> bool:
-    """Whether metric forward kinematics is at the ``goal`` (4, 4), or at what it does to ``point`` (3,), all along the
-    self-motions of ``answer``, over `KEPT` either way; False where it has none.
+    """Whether metric forward kinematics keeps the ``goal`` (4, 4), or its effect on ``point`` (3,), along all
+    self-motions of ``answer``, over `KEPT` to either side; False if it has none.
     """
     back = np.linalg.inv(hidden.frame)
     points = np.eye(4) if point is None else (hidden.frame @ np.append(point, 1.0))[None]

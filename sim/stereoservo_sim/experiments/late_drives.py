@@ -1,20 +1,19 @@
-"""Experiments: drives and pictures that are late, on the cells of `random_rigs`, all joints alike, by the servo core; a
-range of seeds is continued with another.
+"""Experiments: delayed drives and images, on the cells of `random_rigs`, with equal joints, by the servo core; a
+range of seeds is continued by another.
 
-``late-drives``: commands arrive 100 to 200 ms late at drives held by friction of up to 10 mrad/s, which nobody has
-stated: goals with the model that is fitted to the arm's own trial motions, and beside it with the true one. Each goal
-is that of a core that has just been started with its model, and so knows no delay: what the trial motions have shown of
-it is forgotten.
+``late-drives``: drives obey commands 100 to 200 ms late and are held by friction of up to 10 mrad/s, both unreported.
+Goals use the model fitted to the arm's own calibration motion, and beside it the true one. Each goal is run by a newly
+started core, which knows no delay: the delay measured in the calibration motion is discarded.
 
 ``damped-drives`` (thesis 9.3): drives follow their velocity with a lag, or obey late; goals with and without damping,
-with the true model, over ways so short that gain and lag decide and not the joints' limits.
+with the true model, over paths so short that gain and lag are decisive, not the joints' limits.
 
-``late-pictures``: pictures are 0 to 150 ms older than their stamps tell, with up to 20 ms of jitter, and nobody has
-stated it: the trial motions of the servo core show it, the model states it; a goal is driven with the model as fitted,
-with the true offset in its place, and with none.
+``late-pictures``: images are 0 to 150 ms older than their stamps, with up to 20 ms of jitter, unreported. The core's
+calibration motion shows the offset, and the model states it. A goal is run with the fitted model, with the true offset
+in its place, and with none.
 
-The overshoot is the farthest that a marker goes beyond its set-point in an image, along its way, over the longest way
-of one.
+The overshoot is the largest distance of a marker beyond its set-point in an image, along its path, as a share of the
+longest path of a marker.
 """
 
 from __future__ import annotations
@@ -42,22 +41,23 @@ from stereoservo_sim.world.random_cells import RandomCase, random_case
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 DELAYS_S, FRICTION = (0.1, 0.2), 0.01
-"""[s], [rad/s]"""
+"""Ranges of the delay [s] and the friction [rad/s]."""
 NOISE_PX = 0.05
 
 
 WITHIN = 2.0
-"""Tolerances of the true error at rest."""
+"""Largest true error at rest, in tolerances."""
 MORE = 0.01
-"""Overshoot that counts as more than the true model's, of the longest way."""
+"""Excess over the true model's overshoot that counts, as a share of the longest path."""
 LONG = 0.5
-"""Of the longest way in the images, from which on a marker's overshoot counts."""
+"""Least length of a path whose overshoot counts, as a share of the longest path in the images."""
 MODELS = ("learnt", "true")
 
 
 class DriveVerdict(msgspec.Struct, frozen=True):
-    """Outcome of a case: by the model, how the goal ended, its true error [px] at rest and the overshoot. ``code``: why
-    there is none.
+    """Outcome of a case: by model, the goal's end, its true error [px] at rest and the overshoot. ``code``: why there
+    is
+    none.
     """
 
     seed: int
@@ -90,12 +90,12 @@ def judged_drives(seed: int) -> DriveVerdict:
 
 
 def _learnt_by_core(case: RandomCase, wrong: Imperfections) -> CellModel:
-    """The model of the trial motions that the servo core drives. Raises CalibrationError."""
+    """The model of the calibration motion driven by the servo core. Raises CalibrationError."""
     return fit_model(DrivenCell(case.cell, None, case.cell.home, case.seed, wrong).trials(), epoch=1).model
 
 
 def _driven_to(driven: DrivenCell, goal: FloatArray) -> tuple[str, float]:
-    """How a goal at the configuration ``goal`` (n,) ended, and its true error [px] after a second of rest."""
+    """The end of a goal at the configuration ``goal`` (n,), and its true error [px] after a second of rest."""
     wanted = driven.cell.pixels(goal[None])[:, 0]
     end = driven.run_goal(wanted)
     shown, _ = driven.rest(1.0)
@@ -103,7 +103,7 @@ def _driven_to(driven: DrivenCell, goal: FloatArray) -> tuple[str, float]:
 
 
 def overshoot_of(cell: SyntheticCell, driven: DrivenCell, goal: FloatArray) -> float:
-    """Of the arm's way to the configuration ``goal`` (n,), over the longest way of a marker."""
+    """Overshoot of the arm's motion to the configuration ``goal`` (n,), as a share of the longest path of a marker."""
     pixels, wanted = cell.pixels(np.array(driven.path)), cell.pixels(goal[None])[:, 0]
     way = wanted - pixels[:, 0]
     length = np.linalg.norm(way, axis=-1)
@@ -140,11 +140,11 @@ def run_late_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent) 
 
 
 draw_late_drives = drawing_sorted("late_drives", "overshoots", "overshoot, of the longest way")
-"""With the model that was learnt and with the true one."""
+"""Overshoots with the learnt model and with the true one."""
 
 
 def notes_late_drives(answer: dict[str, Any]) -> Iterator[str]:
-    """The largest overshoots, how goals ended, and every case beyond."""
+    """The largest overshoots, the ends of goals, and every case beyond the limits."""
     yield f"largest overshoot, of the way: {answer['overshoot']}; ends: {answer['ends']}; {answer['no_case']}"
     yield from map(str, answer["lost"])
 
@@ -153,17 +153,17 @@ def notes_late_drives(answer: dict[str, Any]) -> Iterator[str]:
 
 DRIVES = {"lag 0.1 s": Mechanics(lag_s=0.1), "lag 0.2 s": Mechanics(lag_s=0.2), "0.1 s late": Mechanics(delay_s=0.1)}
 SETTINGS = ((2.0, 0.0), (4.0, 0.0), (8.0, 0.0), (4.0, 0.5), (8.0, 0.5), (8.0, 0.7))
-"""Gain [1/s] and damping."""
+"""Gains [1/s] and damping."""
 
 
 DAMPED_SHARE = 0.08
-"""Of the joints' ranges from which goals are drawn."""
+"""Share of the joints' ranges from which goals are drawn."""
 TIME_LIMIT_S = 20.0
 LAW = "stereo"
 
 
 def damped_goal(seed: int, drive: str, gain: float, damping: float) -> tuple[GoalEnd, float] | None:
-    """How a goal of the case of ``seed`` ended and its overshoot; None where the case has no goal in view."""
+    """The end of a goal of the case of ``seed`` and its overshoot; None if the case has no goal in view."""
     case = random_case(seed)
     try:
         start, goal = places_in_view(case, np.random.default_rng([seed, 19]), 2, DAMPED_SHARE)
@@ -177,7 +177,9 @@ def damped_goal(seed: int, drive: str, gain: float, damping: float) -> tuple[Goa
 
 
 def run_damped_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1`` by every drive, gain and damping; the JSON object of the command."""
+    """Run cases ``seed`` to ``seed + seeds - 1`` with every drive, gain and damping; returns the JSON object of the
+    command.
+    """
     rows: list[dict[str, Any]] = []
     curves: dict[str, list[float]] = {}
     conditions = [(drive, *setting) for drive in DRIVES for setting in SETTINGS]
@@ -209,17 +211,17 @@ def run_damped_drives(seeds: int, seed: int = 0, progress: ProgressCall = silent
 
 
 draw_damped_drives = drawing_sorted("damped_drives", "overshoots", "overshoot, of the longest way")
-"""By drive, gain and damping."""
+"""Overshoots by drive, gain and damping."""
 
 
 # -- late pictures ---------------------------------------------------------------------------------------------
 
 LATEST_S, JITTER_S = 0.15, 0.02
-"""[s] The largest of each."""
+"""Largest offset and jitter [s]."""
 
 
 WITHIN_S = 0.002
-"""[s] Of the true mean offset: what may be left."""
+"""Largest error of the mean offset [s]."""
 
 
 PICTURE_DRAWS = 100
@@ -227,8 +229,8 @@ KNOWLEDGE = ("learnt", "true", "none")
 
 
 class LateVerdict(msgspec.Struct, frozen=True):
-    """Outcome of a case: true mean offset and jitter [s], what of it the model does not know (``residual_s``, the worst
-    camera), and by what the model knows of it: how a goal ended, and its true error [px]. ``code``: no model.
+    """Outcome of a case: true mean offset and jitter [s], error of the model's offset (``residual_s``, the worst
+    camera), and for each offset used the goal's end and its true error [px]. ``code``: no model.
     """
 
     seed: int
@@ -242,7 +244,7 @@ class LateVerdict(msgspec.Struct, frozen=True):
 
 
 def judged_late(seed: int, drive: bool = True) -> LateVerdict:
-    """Outcome of the case of ``seed``; without goals where not ``drive``."""
+    """Outcome of the case of ``seed``; without goals unless ``drive``."""
     case = random_case(seed)
     rng = np.random.default_rng([seed, 9])
     late_s, jitter_s = rng.uniform(0.0, LATEST_S), rng.uniform(0.0, JITTER_S)
@@ -268,8 +270,8 @@ def judged_late(seed: int, drive: bool = True) -> LateVerdict:
 
 
 def run_late_pictures(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1``: how many offsets are known to ``WITHIN_S``, how the goals end by what is
-    known, and every case beyond.
+    """Cases ``seed`` to ``seed + seeds - 1``: number of offsets known to ``WITHIN_S``, ends of the goals by the offset
+    used, and every case beyond the limits.
     """
     judged = cases(judged_late, seeds, seed, progress)
     known = [case for case in judged if not case.code]
@@ -297,13 +299,13 @@ def _plain(case: LateVerdict) -> dict[str, Any]:
 
 
 def draw_late_pictures(answer: dict[str, Any]) -> Figures:
-    """What the model does not know of the offsets, beside what is asked."""
+    """Errors of the model's offsets, beside the limit."""
     residuals = {"worst camera": answer["residual_ms"]}
     return {"late_pictures": sorted_values(residuals, "residual offset [ms]", 1e3 * WITHIN_S)}
 
 
 def notes_late_pictures(answer: dict[str, Any]) -> Iterator[str]:
-    """How the goals ended, and every case whose offset is not known."""
+    """Ends of the goals, and every case with an unknown offset."""
     yield f"true error at rest, mean [px]: {answer['mean_error_px']}; residuals [ms]: {answer['residual_ms']}"
     yield f"ends by what is known: {answer['ends']}; cases without a model: {answer['no_model']}"
     for case in answer["beyond"]:

@@ -1,7 +1,7 @@
 """Experiment ``laws``: every law on three demanding tasks, and a sketch of every kind of goal.
 
-The pictures of `docs/goals-and-laws.md`, small enough for the repository. Laws run as in ``stereoservo simulate``: the
-free arm, self-calibrated; the controller sees noisy pixels, the table and the pictures show the truth. Sketches are
+Figures of `docs/goals-and-laws.md`, small enough for the repository. Laws run as in ``stereoservo simulate``: the
+free arm, self-calibrated; the controller sees noisy pixels, the table and the figures show the truth. Sketches are
 short motions of the free arm with its exact model, without noise.
 """
 
@@ -47,11 +47,13 @@ from stereoservo_sim.world.synthetic import rotation, translation
 
 NOISE_PX = 0.1
 LARGE_ID, BENT_ID = 5032, 5116
-"""Of the shipped hard tasks: one whose turn swings corners out of the image, one whose straight path leaves it."""
+"""Two of the shipped hard tasks: one whose rotation swings corners out of the image, one whose straight path leaves
+it.
+"""
 ROLL_ID = 1
 CURRENT = "stereo, current"
 VARIANTS = ("stereo", CURRENT, *(law for law in LAWS if law != "stereo"))
-"""The laws by name, and the classical one, developed around the present points; else around the mean (8.1.1)."""
+"""The laws by name, and the classical one, linearised at the current points; else at the mean (8.1.1)."""
 THESIS = {
     "roll": "8.7: of three classical laws one diverges, two show the plate's back before they converge; "
     "both Cartesian ones converge with the face in view"
@@ -60,7 +62,7 @@ THESIS = {
 
 @dataclass(frozen=True, eq=False)
 class ComparedRun:
-    """A law on a task: its evaluation, and the path taken."""
+    """A law on a task: its evaluation, and its path."""
 
     name: str
     task: AlignmentTask
@@ -77,7 +79,7 @@ class LawComparison:
 
 
 def compared_tasks() -> dict[str, AlignmentTask]:
-    """``large`` 132° and 0.32 m, ``roll`` thesis 8.7, ``bent`` 117° and 0.39 m beside the images' borders."""
+    """``large`` 132° and 0.32 m, ``roll`` thesis 8.7, ``bent`` 117° and 0.39 m near the images' borders."""
     shipped = {task.id: task for task in read_tasks(shipped_tasks_path())}
     return {"large": shipped[LARGE_ID], "roll": tilted_roll(), "bent": shipped[BENT_ID]}
 
@@ -95,7 +97,7 @@ def run_laws(
     laws: tuple[str, ...] = VARIANTS,
     calibration: TaskCalibration | None = None,
 ) -> LawComparison:
-    """Every one of ``laws`` on every task; the arm is calibrated first where no ``calibration`` is given."""
+    """Run each of ``laws`` on every task; the arm is calibrated first if no ``calibration`` is given."""
     tasks = compared_tasks()
     total = len(tasks) * len(laws)
     progress("laws", 0, total)
@@ -116,7 +118,7 @@ def run_laws(
 
 
 def report_laws(comparison: LawComparison) -> dict[str, Any]:
-    """JSON report: a row a task and law."""
+    """JSON report: a row per task and law."""
     rows = [_row(law, run) for runs in comparison.runs.values() for law, run in runs.items()]
     return {
         "experiment": "laws",
@@ -141,7 +143,7 @@ def _row(law: str, run: ComparedRun) -> dict[str, Any]:
 
 
 def show_laws(answer: dict[str, Any], console: Console) -> None:
-    """Print the rows; a view angle of 90° and more is the back, a negative margin is out of the image."""
+    """Print the rows; a view angle of 90° and more shows the back, a negative margin is outside the image."""
     numbers = {
         "error [px]": ("final_error_px", ".3f"),
         "off the line [mm]": ("line_deviation_mm", ".2f"),
@@ -182,7 +184,7 @@ WORKPIECE = np.array(
 )
 """(5, 4) markers of a workpiece in its own frame [m], no four in a plane."""
 CIRCLE_M, TURN_S = 0.1, 8.0
-"""Of a streamed target: radius, and time for a turn."""
+"""Radius of a streamed target's circle, and time of one revolution."""
 
 
 class Drive(NamedTuple):
@@ -203,13 +205,13 @@ def goal_pose() -> FloatArray:
 
 
 class World:
-    """The arm at a start pose, with its controller's knowledge."""
+    """The arm at a start pose, with its controller's model."""
 
     def __init__(self, calibration: TaskCalibration, start: FloatArray) -> None:
         self._calibration = calibration
         self.start = start
         self.knowledge: Knowledge = self._known(start)
-        assert self.knowledge.points is not None  # an exact model knows its body
+        assert self.knowledge.points is not None  # an exact model has the body's points
         self.points: FloatArray = self.knowledge.points
 
     def points_at(self, pose: FloatArray) -> FloatArray:
@@ -280,7 +282,7 @@ def shown(calibration: TaskCalibration, law: str = "stereo") -> Drive:
 
 
 def displaced_twice(calibration: TaskCalibration) -> tuple[Drive, Drive]:
-    """Goal ``displacement``: the same matrix twice, each from the body's present pose."""
+    """Goal ``displacement``: the same matrix twice, each from the body's current pose."""
     pose, drives = start_pose(), []
     first = World(calibration, pose)
     step = translation(0.13, -0.09, 0.0) @ _about(pose, rotation("z", 35))
@@ -298,9 +300,7 @@ def _about(pose: FloatArray, turn: FloatArray) -> FloatArray:
 
 
 def _frame(world: World, pose: FloatArray) -> FloatArray:
-    """Points (5, 4) fixed to a body at ``pose``, in the model's frame, of scale 1, which determine its
-    displacement.
-    """
+    """Points (5, 4) fixed to a body at ``pose``, in the model's frame, of scale 1, which determine its displacement."""
     corners = np.vstack([np.eye(4) * 0.1, [[0.1, 0.1, 0.1, 0.0]]])
     corners[:, 3] = 1.0
     return world.seen_points(corners @ pose.T)[1]
@@ -332,7 +332,9 @@ def carried_over(calibration: TaskCalibration) -> GoalSketch:
 
 
 class OnLine(NamedTuple):
-    """Motions onto ``line`` (2, 2, 2), pixels of two of its points, with the remaining freedoms unused, and used."""
+    """Motions onto ``line`` (2, 2, 2), pixels of two of its points, with the remaining degrees of freedom unused, and
+    used.
+    """
 
     line: FloatArray
     alone: Drive
@@ -341,7 +343,7 @@ class OnLine(NamedTuple):
 
 
 def point_on_line(calibration: TaskCalibration) -> OnLine:
-    """Goal ``incidence``: marker 0 onto a line; the remaining freedoms unused, or used for set-points."""
+    """Goal ``incidence``: marker 0 onto a line; the remaining degrees of freedom unused, or used for set-points."""
     world = World(calibration, start_pose())
     line_pixels, line_points = world.seen_points(np.array([(-0.2, -0.15, 1.05, 1.0), (0.3, -0.05, 1.0, 1.0)]))
     on_line = incidence_task(("point-on-line",), ((0,),), (line_points,), world.knowledge.plane_at_infinity, 0.01)
@@ -369,7 +371,7 @@ class Streamed(NamedTuple):
 
 
 def streamed(calibration: TaskCalibration) -> Streamed:
-    """A target on a circle, one turn after the arm has caught up."""
+    """A target on a circle, one revolution after the arm has caught up."""
     world = World(calibration, start_pose())
 
     def pose_at(k: int) -> FloatArray:
@@ -410,9 +412,9 @@ ENDINGS = {
     "NOT_CONVERGED": "does not arrive",
 }
 AROUND_PX = 25.0
-"""Drawn around the markers' tracks, so that what leaves the image shows beside its border."""
+"""Margin drawn around the markers' tracks, so that parts outside the image show beside its border."""
 LONGEST_S, EVERY = 16.0, 5
-"""Of the curves over time: their length, and every how many steps a point is drawn."""
+"""Length of the curves over time, and number of steps between drawn points."""
 TASKS = {"large": "132° and 0.32 m", "roll": "half a turn, the face tilted by 60°", "bent": "117° and 0.39 m"}
 
 
@@ -438,7 +440,7 @@ def _small(figure: Figure) -> bytes:
 
 
 def _image(axis: Axes, title: str, around: FloatArray | None = None) -> None:
-    """An empty left image with its border; cropped to ``around`` (2, 2), least and largest, where that is given."""
+    """An empty left image with its border; cropped to ``around`` (2, 2), least and largest, if given."""
     axis.add_patch(Rectangle((0, 0), WIDTH, HEIGHT, facecolor="#f4f4f4", edgecolor="#888888", linewidth=0.8))
     low, high = np.array([(-10.0, -10.0), (WIDTH + 10.0, HEIGHT + 10.0)]) if around is None else around
     axis.set_xlim(low[0], high[0])

@@ -1,5 +1,5 @@
 """``bench ik``: duration of the inverse kinematics of images (`stereoservo ik`) on models that arms of several families
-learn at 0.1 px, and whether all postures are found: those that the true model has for noise-free images.
+learn at 0.1 px, and whether all postures of the true model for noise-free images are found.
 """
 
 from __future__ import annotations
@@ -22,14 +22,14 @@ from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 SIGMA = 0.1
-"""[px], of the trials and of the goals' images."""
+"""Noise [px] of the trials and of the goals' images."""
 STOPS = 20
 EACH = 20
-"""Poses of a family a repetition: 1000 are of 50."""
+"""Poses per family and repetition: 1000 are of 50."""
 SHARE = 0.7
-"""Of the trials' ranges, from which poses are drawn."""
+"""Share of the calibration ranges from which poses are drawn."""
 SAME = 0.1
-"""Largest difference of joints [rad or m] of a posture by the learnt model and by the true one."""
+"""Largest joint difference [rad or m] of a posture by the learnt model from that by the true one."""
 FREEDOMS = 6
 RANGES = {"revolute": np.pi, "prismatic": 1.0}
 """Limits to either side of home [rad or m]."""
@@ -45,7 +45,7 @@ FAMILIES: dict[str, Callable[[], SyntheticCell]] = {
 
 
 def run_ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Of every family: milliseconds a goal, and postures found of those that the true model has."""
+    """For every family: milliseconds a goal, and share of the true model's postures that are found."""
     poses = EACH * repetitions
     rows = []
     for k, (name, make) in enumerate(FAMILIES.items()):
@@ -55,7 +55,7 @@ def run_ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any
 
 
 def family(name: str, cell: SyntheticCell, poses: int, rng: np.random.Generator) -> dict[str, Any]:
-    """The figures of one family, by ``poses`` goals on the model that its arm learns."""
+    """The figures of one family, for ``poses`` goals on the model that its arm learns."""
     learnt, exact = fit_model(cell.trials(SIGMA, rng, STOPS), epoch=1).model, exact_model(cell)
     began = time.perf_counter()
     known = recognise(learnt)
@@ -77,7 +77,7 @@ def family(name: str, cell: SyntheticCell, poses: int, rng: np.random.Generator)
             continue
         cpu.append(time.process_time() - work)
         wall.append(time.perf_counter() - at)
-        redundant = len(q) > FREEDOMS  # of a continuum any posture that shows the images will do
+        redundant = len(q) > FREEDOMS  # any posture of a continuum that shows the images counts
         reached += bool(answer.images.solutions if redundant else near(cell, q[None], answer)[0])
         if not redundant:
             right = postures(exact, pixels, SIGMA, limits=limits, recognition=truth).images.solutions
@@ -91,13 +91,13 @@ def family(name: str, cell: SyntheticCell, poses: int, rng: np.random.Generator)
 
 
 def limits_of(cell: SyntheticCell) -> FloatArray:
-    """(n, 2) [rad or m] about home."""
+    """Limits (n, 2) [rad or m] about home."""
     room = np.array([RANGES[kind] for kind in cell.kinds])
     return np.column_stack([cell.home - room, cell.home + room])
 
 
 def near(cell: SyntheticCell, joints: FloatArray, answer: Postures) -> FloatArray:
-    """Which of ``joints`` (s, n) are among the postures of ``answer``, (s,)."""
+    """Mask (s,) of the ``joints`` (s, n) that are among the postures of ``answer``."""
     others = np.array([one.q for one in answer.images.solutions]).reshape(-1, len(cell.kinds))
     apart = joints[:, None] - others
     turns = np.array([kind == "revolute" for kind in cell.kinds])

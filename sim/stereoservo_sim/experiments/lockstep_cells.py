@@ -1,4 +1,4 @@
-"""Cells in lockstep that experiments share: shipped ones with a fake arm, and a goal that is taught and reached."""
+"""Cells in lockstep shared by experiments: shipped ones with a fake arm, and a goal that is taught and reached."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 RATE_HZ, CAMERA_HZ = 50.0, 10.0
-"""Of cells with rendered pictures."""
+"""Rates of cells with rendered images."""
 LATENCY_S = 0.012
 TOLERANCE_PX, HOLD_FRAMES, TAUGHT_FRAMES = 0.25, 6, 10
 LIMIT_S, REST_S = 40.0, 1.0
@@ -37,7 +37,7 @@ def lockstep(
     files: dict[str, str] | None = None,
     recording: Path | None = None,
 ) -> Iterator[tuple[LockstepCell, Path]]:
-    """The cell and its folder, which has ``files``; the arm's true joints go into ``history``."""
+    """The cell and its folder, which contains ``files``; the arm's true joints are written to ``history``."""
     with tempfile.TemporaryDirectory(prefix="stereoservo-experiment-") as scratch:
         folder = Path(scratch)
         for name, text in (files or {}).items():
@@ -74,14 +74,14 @@ def with_fake_arm(
 
 
 def with_rendered_cameras(cell: CellFile, options: dict[str, Any], **of_arm: Any) -> CellFile:
-    """The cell with a fake arm before cameras that render pictures with these ``options``."""
+    """The cell with a fake arm before cameras that render images with these ``options``."""
     options = {"rate_hz": CAMERA_HZ, "latency_s": LATENCY_S, "background": "arm", **options}
     cameras = (msgspec.structs.replace(camera, options=options) for camera in cell.camera)
     return with_fake_arm(cell, cameras, {"rate_hz": RATE_HZ, **of_arm}, rate_hz=RATE_HZ)
 
 
 def enabled(cell: LockstepCell, model: CellModel, seed: int, settle_s: float) -> LockstepOperator:
-    """The operator of a cell that has just been enabled, with its model."""
+    """The operator of a newly enabled cell with its model."""
     operator = LockstepOperator(cell, seed=seed)
     cell.run_for(settle_s)
     operator.enable()
@@ -93,7 +93,7 @@ def enabled(cell: LockstepCell, model: CellModel, seed: int, settle_s: float) ->
 def taught_and_reached(
     operator: LockstepOperator, away: FloatArray, law: str, shown: FloatArray | None = None
 ) -> tuple[Event, FeatureTarget]:
-    """How a goal ended that was taught where the arm is, or with its joints at ``shown`` (n,), with the arm sent
+    """The end of a goal taught at the arm's position, or with its joints at ``shown`` (n,), with the arm sent
     ``away`` (n,) before; and the goal. Raises LockstepRefusalError, LockstepTimeoutError.
     """
     names = operator.cell.settings.joint_names
@@ -111,7 +111,7 @@ def taught_and_reached(
 
 
 def end_error(world: SimulatedCell, history: TrueJointHistory, goal: FloatArray) -> float:
-    """Largest distance [px] of the markers' projections, with the arm where it is last, from those at ``goal`` (n,)."""
+    """Largest distance [px] of the markers' projections at the arm's last position from those at ``goal`` (n,)."""
     newest = history.newest()
     assert newest is not None  # the arm was enabled
     here, there = world.truth_pixels(newest[1]), world.truth_pixels(goal)

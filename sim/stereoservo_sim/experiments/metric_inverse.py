@@ -1,8 +1,8 @@
 """Inverse kinematics in metric coordinates: reference of the projective solver, vectorised over poses.
 
 Axes are lines of Euclidean space, lengths and angles are measured; joints are eliminated in another order than
-`stereoservo.kinematics.inverse` does where there is a choice. Solutions are (N, s, n) [rad or m], NaN where a branch
-has none. Six revolute joints without a closed form: Newton's method from many random starts.
+in `stereoservo.kinematics.inverse` if there is a choice. Solutions are (N, s, n) [rad or m], NaN for missing branches.
+Six revolute joints without a closed form: Newton's method from many random starts.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
 
 CONSISTENT = 1e-7
-"""Length [m] within which a branch has to end at its goal."""
+"""Largest distance [m] of a branch's end from its goal."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +76,7 @@ def angle_between(w: FloatArray, u: FloatArray, v: FloatArray) -> FloatArray:
 
 
 def harmonic_roots(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
-    """Both roots (N, 2) of ``a cosθ + b sinθ = c``; NaN where there are none."""
+    """Both roots (N, 2) of ``a cosθ + b sinθ = c``; NaN if there are none."""
     size = np.hypot(a, b)
     with np.errstate(invalid="ignore", divide="ignore"):
         half = np.arccos(np.where(np.abs(c) <= size, c / size, np.nan))
@@ -106,8 +106,8 @@ def revolute(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray
 
 
 def two_revolute(axes: EuclideanAxes, p: FloatArray, goal: FloatArray) -> FloatArray:
-    """Solutions (N, 2, 2) of two joints: the second first, by the height along the first axis; the radius about it
-    decides.
+    """Solutions (N, 2, 2) of two joints: the second first, by the height along the first axis, checked by the radius
+    about it.
     """
     (w1, w2), (c1, c2) = axes.directions, axes.points
     seconds = projected_roots(w2, p, c2, w1, goal @ w1)
@@ -287,7 +287,7 @@ def _error(goal: FloatArray, R: FloatArray, t: FloatArray, e: FloatArray) -> flo
     if sine > 1e-12:
         for i in range(3):
             e[i] *= angle / sine
-    # What the turn about the origin does to the present place is no part of the translation still to make.
+    # The effect of the rotation about the origin on the current position is not part of the remaining translation.
     e[3] = goal[0, 3] - t[0] - (e[1] * t[2] - e[2] * t[1])
     e[4] = goal[1, 3] - t[1] - (e[2] * t[0] - e[0] * t[2])
     e[5] = goal[2, 3] - t[2] - (e[0] * t[1] - e[1] * t[0])

@@ -1,8 +1,8 @@
 """Experiment: servoing with more than two cameras, some of them moving, by any pair or all (thesis 9, fig. 9.1).
 
-The demo's arm in lockstep before four cameras, two of which may be carried about. A calibration a seed, one goal shown;
-then the same goal by every pair, by all, by all while both mobile cameras are carried along a smooth path in its
-midst, and by one that was carried with one that stands while the others are covered. Judged by the truth.
+The demo's arm in lockstep before four cameras, two of them mobile. Each seed has a calibration and one taught goal.
+The goal is then run by every pair, by all, by all while both mobile cameras are carried along a smooth path during the
+motion, and by a carried camera with a static one while the others are covered. Evaluated against ground truth.
 """
 
 from __future__ import annotations
@@ -45,17 +45,17 @@ PLACES: dict[str, tuple[str, Moved]] = {
     "high": ("left", Moved((0.10, -0.35, 0.05), (-14.0, 0.0, 0.0))),
     "wide": ("right", Moved((0.30, -0.05, 0.05), (0.0, -12.0, 0.0))),
 }
-"""Which camera of the demo's rig each is, and how far from there it stands, in its own frame."""
+"""Camera of the demo's rig by name, and its displacement from there, in its own frame."""
 MOBILE = ("high", "wide")
 PATHS: dict[str, Moved] = {
     "high": Moved((0.10, 0.0, 0.0), (2.0, -10.0, 1.0)),
     "wide": Moved((0.0, -0.10, 0.0), (-10.0, 1.0, -2.0)),
 }
-"""Where a carried camera is put in the end, from its place, in its own frame."""
+"""Final displacement of a carried camera from its initial pose, in its own frame."""
 CARRIED_S = 3.0
 TOLERANCE_PX = 0.15
 HOLD_FRAMES = 60
-"""So that what is left when a goal ends is noise, and no longer the way there."""
+"""Frames at the goal, so that the remaining error is noise, not residual motion."""
 LIMIT_S = 60.0
 
 
@@ -82,8 +82,8 @@ CONDITIONS = (
 
 @dataclass(frozen=True)
 class CarriedGoalResult:
-    """One goal: distance of the markers from their goal [mm], rms; of the carried cameras, the reprojection error
-    [px] of the matrix found, rms of a coordinate.
+    """One goal: rms distance of the markers from their goal [mm]; of the carried cameras, the rms reprojection error
+    [px] per coordinate of the estimated matrix.
     """
 
     reached: bool
@@ -93,14 +93,14 @@ class CarriedGoalResult:
 
 @dataclass
 class _Carrying:
-    """Cameras that are being carried, and since when."""
+    """Cameras being carried, and their start time."""
 
     since_ns: int = 0
     moves: tuple[str, ...] = ()
 
 
 def run_mobile_cameras(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every condition with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
+    """Run every condition with ``seeds`` seeds from ``seed`` on; returns the JSON object of the command."""
     flown: dict[str, list[CarriedGoalResult]] = {condition.name: [] for condition in CONDITIONS}
     steps = 1 + len(CONDITIONS)
     for k in range(seeds):
@@ -149,7 +149,7 @@ def cell_of() -> CellFile:
 
 
 def calibrated(seed: int) -> tuple[CellModel, FeatureTarget]:
-    """A model, and the goal as the four cameras saw it."""
+    """A model, and the goal as seen by the four cameras."""
     with lockstep(cell_of(), seed) as (cell, _):
         cell.run_for(0.5)
         operator = LockstepOperator(cell, seed=seed)
@@ -263,7 +263,7 @@ def _row(condition: CarryCondition, flown: list[CarriedGoalResult], whole: list[
 
 
 def compare_mobile_cameras(answer: dict[str, Any]) -> list[Comparison]:
-    """Fig. 9.1, which sketches what might be done: whether it is."""
+    """Fig. 9.1, a sketch of a proposal: whether it works."""
     reached, asked = sum(goal["reached"] for goal in answer["goals"]), len(answer["goals"])
     return [
         Comparison(
@@ -278,7 +278,7 @@ def compare_mobile_cameras(answer: dict[str, Any]) -> list[Comparison]:
 
 
 def draw_mobile_cameras(answer: dict[str, Any]) -> Figures:
-    """Final errors, a column a condition."""
+    """Final errors, one column per condition."""
     figure = picture(9, 4)
     axis = figure.subplots()
     draw_points(axis, by_condition(answer, "cameras", "error_mm"), "error at the goal", "[mm]")

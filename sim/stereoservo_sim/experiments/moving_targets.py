@@ -1,14 +1,14 @@
-"""Experiments: targets that move by themselves, followed by cameras on the arm, on a pan-tilt head, and before cameras
-that stand (``moving-targets``), and faults meanwhile (``moving-faults``).
+"""Experiments: moving targets, followed by cameras on the arm, on a pan-tilt head, and before static cameras
+(``moving-targets``), and faults meanwhile (``moving-faults``).
 
-The demo's arm, or the head (thesis 4.5.4), in lockstep. With cameras on the arm the marker body slides or swings before
-them, and the goal is that they see it where they saw it at first; with cameras that stand the workpiece slides beside
-the body, and the goal is that the body stays beside it. Or both ride on a turntable. The two freedoms of a head keep
-one marker where it was in one camera. Judged by the truth, which the core never sees.
+The demo's arm, or the head (thesis 4.5.4), in lockstep. With cameras on the arm the marker body slides or oscillates,
+and the goal is to keep its initial image. With static cameras the workpiece slides beside the body, and the goal is
+that the body stays beside it. Or both are on a turntable. The two degrees of freedom of a head keep one marker at its
+initial pixel in one camera. Evaluated against ground truth, which the core never sees.
 
-Faults: a camera is bumped, a joint's zero goes off, a marker slips; what the watch over the model names, how soon, and
-what it names where nothing happened. Each fault moves the pixels by some px rms; it comes while the target moves, and
-the first verdict after it counts.
+Faults: a camera is bumped, a joint's zero changes, a marker slips. Recorded are the fault that the model monitor
+names, the delay, and false verdicts without a fault. Each fault moves the pixels by some px rms; it occurs while the
+target moves, and the first verdict after it counts.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ NOISE_PX, RATE_HZ = 0.1, 30.0
 GAIN = 2.0
 ON_THE_ARM, STANDING, ON_A_HEAD = "on the arm", "standing", "on a pan-tilt head"
 CELLS = {ON_THE_ARM: "eye_in_hand", STANDING: "workpiece", ON_A_HEAD: "pan_tilt"}
-"""Where the cameras are, and the shipped cell with them there."""
+"""Mounting of the cameras, and the shipped cell with it."""
 LAWS: dict[str, tuple[LawName, ...]] = {
     ON_THE_ARM: ("stereo", "cartesian3"),
     STANDING: ("stereo", "cartesian3"),
@@ -54,7 +54,7 @@ LAWS: dict[str, tuple[LawName, ...]] = {
 
 
 class Way(NamedTuple):
-    """How a target moves: along a line at ``speed`` [m/s], swinging by ``amplitude`` [m] at ``hz`` [Hz], or on a
+    """Motion of a target: along a line at ``speed`` [m/s], oscillating by ``amplitude`` [m] at ``hz`` [Hz], or on a
     turntable at ``turn`` [rad/s].
     """
 
@@ -74,22 +74,22 @@ MOTIONS = {
     "turns at 0.5 rad/s": Way(turn=0.5),
 }
 RADIUS_M, TILT = 0.1, 0.1
-"""Of a target on a turntable from its axis, and of the axis from the line of sight, at most [rad]."""
+"""Distance of a target on a turntable from its axis, and largest angle of the axis from the line of sight [rad]."""
 SPEED_SHARE, STEP_S, DRAWS = 0.8, 0.05, 100
-"""Of its joints' speed limits, what an arm may need for a motion that is asked of it, looked at in such steps; and how
-many are drawn for one.
+"""Largest share of the joints' speed limits that a motion may need, checked in steps of this time; and largest number
+of motions drawn.
 """
 RANGE_LEFT = 0.1
-"""That such a motion leaves of the joints' ranges [rad]."""
+"""Distance to the joints' limits that such a motion leaves [rad]."""
 REST_S, SETTLE_S, JUDGED_S = 1.0, 2.0, 2.0
-"""The target stands; then it moves: until the error is judged, and for so long."""
+"""Time at rest; then in motion before the error is evaluated, and during evaluation."""
 STEADY_PX = 1.0
 
 
 @dataclass(frozen=True)
 class Followed:
-    """How a moving target was followed: largest and rms distance [px] of a marker from its goal, over cameras, markers
-    and time; the ``verdicts`` that the watch over the model gave, and why the goal ended, '' where it did not.
+    """Accuracy of following a moving target: largest and rms distance [px] of a marker from its goal, over cameras,
+    markers and time; the ``verdicts`` of the model monitor, and why the goal ended, '' if it did not.
     """
 
     largest_px: float
@@ -99,7 +99,7 @@ class Followed:
 
 
 def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every place, law and motion with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
+    """Run every mounting, law and motion with ``seeds`` seeds from ``seed`` on; returns the command's JSON object."""
     rows: list[dict[str, Any]] = []
     conditions = [(place, law, name, True) for place in CELLS for law in LAWS[place] for name in MOTIONS]
     conditions += [(ON_THE_ARM, "stereo", name, False) for name in MOTIONS]
@@ -135,7 +135,7 @@ def run_moving_targets(*, seeds: int, seed: int, progress: ProgressCall) -> dict
 
 @lru_cache(maxsize=len(CELLS))
 def world_of(place: str) -> SimulatedCell:
-    """The simulated world of the shipped cell with its cameras in a place of `CELLS`."""
+    """The simulated world of the shipped cell with its cameras mounted as in `CELLS`."""
     path = shipped_cell_path(CELLS[place])
     return true_cell(load_cell_file(path), path.parent)
 
@@ -154,8 +154,9 @@ def cell_of(place: str) -> CellFile:
 
 
 def motion_of(place: str, name: str, seed: int, since_ns: int) -> Motion:
-    """One of `MOTIONS` in a cell, along, or about, what the seed says; of turntables the first that the arm can follow:
-    where it comes near a singularity of its wrist, or to the end of a joint's range, another.
+    """One of `MOTIONS` in a cell, with a direction or axis drawn from the seed; of turntables the first that the arm
+    can
+    follow without a wrist singularity or the end of a joint's range.
     """
     cell, way = world_of(place), MOTIONS[name]
     if way.turn:
@@ -179,9 +180,12 @@ def direction_of(cell: SimulatedCell, seed: int) -> FloatArray:
 
 
 def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, since_ns: int) -> Motion:
-    """A turntable that turns at ``turn`` [rad/s], either way, its axis `RADIUS_M` beside the target and nearly along
-    the line of sight: anywhere round a target before cameras on the arm; beside a workpiece on the body's side, so that
-    the arm reaches the body's place all the way.
+    """A turntable at ``turn`` [rad/s], either sense, its axis `RADIUS_M` beside the target and nearly along the line of
+    sight.
+
+    With cameras on the arm the axis may be anywhere around the target; beside a workpiece it is on the body's side, so
+    that
+    the arm can reach the body's pose all the time.
     """
     to_world = _camera_to_world(cell)
     axis = to_world @ np.array([*rng.uniform(-TILT, TILT, 2), 1.0])
@@ -200,8 +204,9 @@ def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, sin
 
 
 def share_of_speed(place: str, motion: Motion) -> float:
-    """The largest share of a joint's speed limit that an arm needs to go with the target, without bound where a joint
-    would leave its range; 0 of a head, which cannot go with it.
+    """Largest share of a joint's speed limit that an arm needs to follow the target; infinite if a joint would leave
+    its
+    range; 0 for a head, which cannot follow it.
     """
     if place == ON_A_HEAD:
         return 0.0
@@ -235,7 +240,7 @@ def _three(vector: FloatArray) -> tuple[float, float, float]:
 
 
 def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> Followed:
-    """Follow a target that moves in one way; deterministic given the seed."""
+    """Follow a target with one motion; deterministic given the seed."""
     world = world_of(place)
     history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
     seen: list[tuple[int, FloatArray]] = []
@@ -250,7 +255,7 @@ def follow(place: str, law: LawName, name: str, seed: int, *, follows: bool) -> 
     with under_way(place, law, name, seed, history, follows=follows, watch=watch) as (cell, goal, motion):
         cell.run_for(SETTLE_S + JUDGED_S)
         ends = [e for e in cell.events if e.id == goal.id and e.kind in ("goal_aborted", "goal_cancelled")]
-    assert motion.since_ns is not None  # it sets out in mid-run
+    assert motion.since_ns is not None  # it starts during the run
     judged = [(t, q) for t, q in seen if t >= motion.since_ns + round(SETTLE_S * 1e9)]
     judged_by = _judged_by(place, world)
     errors = np.array([_errors(world, motion.at(t), q)[judged_by] for t, q in judged[::3]])
@@ -267,7 +272,7 @@ def under_way(
     place: str, law: LawName, name: str, seed: int, history: TrueJointHistory, *, follows: bool,
     watch: Callable[[StepInputs, StepOutputs], None] | None = None,
 ) -> Iterator[tuple[LockstepCell, Goal, Motion]]:  # fmt: skip
-    """The cell with its goal at the moment at which the target sets out, and that motion."""
+    """The cell with its goal at the start of the target's motion, and that motion."""
     world = world_of(place)
     with lockstep(cell_of(place), seed, history, watch) as (cell, folder):
         enabled(cell, exact_simulated_model(world, seed), seed, 0.5)
@@ -280,7 +285,7 @@ def under_way(
 
 
 def _judged_by(place: str, world: SimulatedCell) -> BoolArray:
-    """Markers of cameras (c, m) that the goal shows: all; of a head the one in the middle of the first camera."""
+    """Mask of markers by camera (c, m) that the goal uses: all; for a head the middle one in the first camera."""
     if place != ON_A_HEAD:
         return np.ones((len(world.rig.cameras), len(world.body.ids)), dtype=bool)
     first = world.rig.cameras[0]
@@ -293,7 +298,7 @@ def _judged_by(place: str, world: SimulatedCell) -> BoolArray:
 
 
 def _goal(world: SimulatedCell, law: LawName, follows: bool, shown: BoolArray) -> Goal:
-    """What is seen now of the markers ``shown`` (c, m), relative to the target where it is now."""
+    """Current observations of the markers ``shown`` (c, m), relative to the target's current pose."""
     named = partial(_named, decimals=6)
     target = FeatureTarget(
         {
@@ -323,7 +328,7 @@ def _named(ids: Any, pixels: FloatArray, decimals: int) -> dict[int, tuple[float
 
 
 def _errors(world: SimulatedCell, moved: Moved, q: FloatArray) -> FloatArray:
-    """Distances (c, m) [px] of the body's markers from where the goal has them, with the arm at ``q`` (n,)."""
+    """Distances (c, m) [px] of the body's markers from their positions in the goal, with the arm at ``q`` (n,)."""
     here = world
     if world.stand is not None:
         here = SimulatedCell(world.robot, world.body, world.rig, world.base, moved_pose(world.stand, moved))
@@ -339,7 +344,7 @@ def _errors(world: SimulatedCell, moved: Moved, q: FloatArray) -> FloatArray:
 
 
 def _carried(world: SimulatedCell, points: FloatArray, moved: Moved) -> FloatArray:
-    """Points (m, 3) that go with the workpiece."""
+    """Points (m, 3) that move with the workpiece."""
     part = world.workpiece
     assert part is not None
     D = part.pose(moved) @ np.linalg.inv(part.stand)
@@ -347,7 +352,7 @@ def _carried(world: SimulatedCell, points: FloatArray, moved: Moved) -> FloatArr
 
 
 def draw_moving_targets(answer: dict[str, Any]) -> Figures:
-    """Largest errors, a bar a condition."""
+    """Largest errors, one bar per condition."""
     figure = picture(9, 4)
     axis = figure.subplots()
     rows = answer["rows"]
@@ -371,27 +376,27 @@ FAULTS: dict[Fault, tuple[str, ...]] = {
     "joint zero jumps": ("joint_zero", "JOINT_NOT_FOLLOWING"),
     "marker slipped": ("marker_slipped",),
 }
-"""What happens, and the verdicts and faults that name it."""
+"""Faults, and the verdicts and fault codes that name them."""
 FAULT_PX: dict[Fault, tuple[float, float]] = {
     "camera bumped": (2.0, 10.0),
     "joint zero drifts": (2.0, 10.0),
     "joint zero jumps": (10.0, 40.0),
     "marker slipped": (2.0, 10.0),
 }
-"""How far it moves the markers that it moves in the images [px], rms."""
+"""Rms image displacement [px] of the markers that a fault moves."""
 BEFORE_S, AFTER_S = 1.5, 1.5
-"""The target moves, then there is a fault, and the watch has so long to name it."""
+"""Time of target motion before the fault, and time for the monitor to name it."""
 UNCLEAR = "unclear"
-"""The verdict that something is wrong which several causes explain alike; it names none."""
+"""Verdict of a fault with several equally likely causes; it names none."""
 DRIFT_NS, JUMP_NS = 1_000_000_000, 20_000_000
-"""In which a joint's zero drifts, and jumps: within a frame."""
+"""Time in which a joint's zero drifts, and jumps: within a frame."""
 
 
 @dataclass(frozen=True)
 class Named:
-    """What was named: the ``verdict`` and its ``subject``, '' where nothing was, ``delay_s`` after the fault, whether
-    that is ``right``, of a fault of ``size_px``; ``early``: verdicts before it; ``unclear``: whether it was told that
-    something is wrong before, or without, what it is.
+    """Named fault: the ``verdict`` and its ``subject``, '' if none, ``delay_s`` after the fault, whether it is
+    ``right``, for a fault of ``size_px``; ``early``: verdicts before it; ``unclear``: whether a fault was reported
+    before, or without, its cause.
     """
 
     verdict: str
@@ -405,7 +410,9 @@ class Named:
 
 
 def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every place and fault with ``seeds`` seeds from ``seed`` on, motions in turn; the JSON object of the command."""
+    """Run every mounting and fault with ``seeds`` seeds from ``seed`` on, motions in turn; returns the command's JSON
+    object.
+    """
     rows: list[dict[str, Any]] = []
     conditions = [(place, fault) for place in CELLS for fault in FAULTS]
     motions = list(MOTIONS)
@@ -450,7 +457,7 @@ def run_moving_faults(*, seeds: int, seed: int, progress: ProgressCall) -> dict[
 
 
 def disturb(place: str, fault: Fault, name: str, seed: int) -> Named:
-    """Follow a target, and disturb the cell; deterministic given the seed."""
+    """Follow a target, and inject a fault; deterministic given the seed."""
     world = world_of(place)
     history = TrueJointHistory.in_memory(len(world.base), capacity=1 << 14)
     with under_way(place, LAWS[place][-1], name, seed, history, follows=True) as (cell, _, _):
@@ -461,7 +468,7 @@ def disturb(place: str, fault: Fault, name: str, seed: int) -> Named:
 def named_after(
     cell: LockstepCell, world: SimulatedCell, history: TrueJointHistory, fault: Fault, name: str, seed: int
 ) -> Named:
-    """What is named after a fault that comes now."""
+    """Result of the monitor after a fault at this time."""
     rng = np.random.default_rng([seed, list(FAULTS).index(fault), 37])
     size_px = float(rng.uniform(*FAULT_PX[fault]))
     onset_ns, newest = cell.clock.now_ns(), history.newest()
@@ -480,12 +487,12 @@ def named_after(
 
 
 def _number(value: float) -> float | None:
-    """A finite number, else None: what no event was named in has no delay."""
+    """A finite number, else None: no event has no delay."""
     return value if np.isfinite(value) else None
 
 
 def _verdict(event: Event) -> str:
-    """The verdict of the watch over the model, or the code of a fault."""
+    """The verdict of the model monitor, or the code of a fault."""
     return event.name if event.kind == "health" else ", ".join(reason.code for reason in event.reasons)
 
 
@@ -498,7 +505,7 @@ def _pixels(world: SimulatedCell, q: FloatArray) -> FloatArray:
 
 
 def _bump(cell: LockstepCell, world: SimulatedCell, q: FloatArray, size_px: float, rng: np.random.Generator) -> str:
-    """Turn one camera about a random axis in its own frame."""
+    """Rotate one camera about a random axis in its own frame."""
     c = int(rng.integers(len(cell.cameras)))
     axis = rng.standard_normal(3)
     axis /= np.linalg.norm(axis)
@@ -529,7 +536,7 @@ def _zero_off(
     rng: np.random.Generator,
     over_ns: int,
 ) -> str:
-    """Have one joint's encoder read otherwise than before, coming about ``over_ns``."""
+    """Change the offset of one joint's encoder, within ``over_ns``."""
     joint = int(rng.integers(len(q)))
     small = 1e-4 * np.eye(len(q))[joint]
     slope = _rms(_pixels(world, q + small) - _pixels(world, q)) / 1e-4
@@ -579,11 +586,11 @@ _DISTURBANCES: dict[Fault, Callable[..., str]] = {
     "joint zero jumps": partial(_zero_off, over_ns=JUMP_NS),
     "marker slipped": _slip_marker,
 }
-"""Each does it to a cell, and returns the subject that is to be named."""
+"""Each injects a fault into a cell, and returns the subject that should be named."""
 
 
 def draw_moving_faults(answer: dict[str, Any]) -> Figures:
-    """Named rightly, wrongly and not at all, a bar a row."""
+    """Correctly, wrongly and not named faults, one bar per row."""
     rows = answer["rows"]
     names = [f"{row['cameras']}, {row['fault']}" for row in rows]
     return {"moving-faults": stacked_bars(rows, names, ("right", "wrong", "none"))}

@@ -1,11 +1,11 @@
 """Experiment ``pan-tilt`` (table 4.1, figs 4.8, 4.9): calibration of a pan-tilt head, and prediction of images
 after a motion; and the simulated head of thesis 4.5, two cameras on two joints before a mountain of interest points,
-which `homing` uses, too.
+also used by `homing`.
 
-Points reconstructed from one stereo image are moved by the joints' difference and compared with the next image. What
-is left with a perfect calibration is the noise of the two images; the calibration adds little to it. Rendered: a
+Points reconstructed from one stereo image are moved by the joints' difference and compared with the next image. The
+residual with a perfect calibration is the noise of the two images; the calibration adds little to it. Rendered: a
 textured mountain, its interest points matched between the cameras by the product's learner of landmarks, and tracked
-from picture to picture by correlation.
+from image to image by correlation.
 """
 
 from __future__ import annotations
@@ -57,19 +57,19 @@ from stereoservo_sim.world.synthetic import SyntheticCell, dh_link, placed, rota
 Noise = Literal["independent", "drifting"]
 
 SIGMA = 0.3
-"""[px] an axis, between consecutive images (4.5.1)."""
+"""Noise [px] per axis, between consecutive images (4.5.1)."""
 PIXEL_MM = 0.011
 FOCAL_PX = 12.5 / PIXEL_MM
 WIDTH, HEIGHT = 768, 576
 BASELINE, DISTANCE = 0.35, 2.0
-"""[m] (4.5.1)."""
+"""Baseline and distance [m] (4.5.1)."""
 POINTS = 200
 PAN_STEPS, TILT_STEPS, STEP = 20, 10, np.radians(1.0)
-"""(4.5.2)"""
+"""Steps of the trajectories, and their size (4.5.2)."""
 PAN_USED, TILT_USED = (0, 5, 10, 15, 20), (0, 3, 7, 10)
-"""Steps that calibrate; the others evaluate."""
+"""Steps used for calibration; the others are for evaluation."""
 CALIBRATING_POINTS = 60
-"""Interest points that calibrate; the others evaluate."""
+"""Interest points used for calibration; the others are for evaluation."""
 HEAD_ASSUMED = [
     f"pixels of {1000 * PIXEL_MM:.0f} um, so that 12.5 mm lenses have a focal length of {FOCAL_PX:.0f} px; images of "
     f"{WIDTH}x{HEIGHT} px",
@@ -126,8 +126,8 @@ def general_positions(cell: SyntheticCell, rng: np.random.Generator, count: int)
 
 
 def tracked(exact: FloatArray, noise: Noise, rng: np.random.Generator, first: FloatArray | None = None) -> FloatArray:
-    """Pixels (c, s, m, 2) of tracks through s images with the tracker's noise; ``first`` (c, m, 2): the error that the
-    first image has already.
+    """Pixels (c, s, m, 2) of tracks through s images with the tracker's noise; ``first`` (c, m, 2): error of the first
+    image.
     """
     errors = rng.normal(0, SIGMA, exact.shape)
     if first is not None:
@@ -151,8 +151,8 @@ class Tracks:
 
 
 class SeenHead(NamedTuple):
-    """A head and what it saw: ``tracks`` of both trajectories; tracked ``pixels`` (c, s, m, 2) at ``general`` positions
-    (s, 2), and ``exact`` ones.
+    """A head and its observations: ``tracks`` of both trajectories; tracked ``pixels`` (c, s, m, 2) at ``general``
+    positions (s, 2), and ``exact`` ones.
     """
 
     cell: SyntheticCell
@@ -214,7 +214,7 @@ class HeadCalibration:
 
     def deviations(self) -> Iterator[tuple[SeenChain, SeenChain]]:
         """The head one standard deviation to either side along each column of a root of the covariance of joints and
-        cameras: outer products of what they do add up to what the calibration's noise does.
+        cameras: the outer products of their effects add up to the effect of the calibration's noise.
         """
         charts = self.solution.charts
         size = charts.size - 3 * len(self.solution.rig.points)
@@ -230,7 +230,7 @@ def _seen(rig: RigModel, zero: FloatArray) -> SeenChain:
 
 
 def calibrated(trials: TrialData) -> HeadCalibration:
-    """The ordinary fit, and the plain bundle of pinholes there, whose covariance is asked for.
+    """The ordinary fit, and from it the plain bundle of pinholes, whose covariance is used.
 
     Raises CalibrationError as `fit_model` does.
     """
@@ -262,8 +262,8 @@ def separate_rotations(trials: TrialData) -> SeenChain:
     """Head from two rotations estimated separately (4.42), as in the thesis: cameras by their epipolar geometry,
     each generator linear, then of maximum likelihood with free points.
 
-    Both trajectories start at the first stop, which is the chain's zero. Raises CalibrationError, GeometryError where
-    nothing like a rotation is seen.
+    Both trajectories start at the first stop, which is the chain's zero. Raises CalibrationError, GeometryError if no
+    rotation is seen.
     """
     cameras, points, usable = initial_reconstruction(trials)
     zero = trials.positions[0]
@@ -282,32 +282,32 @@ def separate_rotations(trials: TrialData) -> SeenChain:
     return SeenChain(chain, cameras, pinhole_lenses(len(cameras)), ("pan", "tilt"))
 
 
-# -- through rendered pictures ---------------------------------------------------------------------------------
+# -- with rendered images -------------------------------------------------------------------------------------
 
 NOISE_GREY = 2.0
-"""[grey levels]"""
+"""Noise of rendered images [grey levels]."""
 ROWS, COLUMNS = 4, 3
-"""Of rocks, one behind the other and higher, and side by side."""
+"""Rows of rocks, each behind and above the last, and rocks per row."""
 SIDE, APART = 0.11, 0.115
-"""[m] Of a rock, and between those side by side."""
+"""Side of a rock, and distance of neighbours in a row [m]."""
 DEEP, RISE = 0.10, 0.03
-"""[m] From row to row."""
+"""Depth and rise from row to row [m]."""
 TEXELS, TEXTURE = 128, 6.0
-"""Of a rock's texture along a side, and its finest structure [texels]: some 3 px."""
+"""Texels along a side of a rock's texture, and its finest structure [texels]: some 3 px."""
 EPIPOLAR_PX = 3.0
-"""Farther from its epipolar line no tracked point is kept: ten times the noise between consecutive images."""
+"""Largest distance of a tracked point from its epipolar line: ten times the noise between consecutive images."""
 PICTURES_ASSUMED = [
     "rendered: a mountain of twelve textured rocks, 2 grey levels of noise; interest points matched between cameras by "
     "the product's learner of landmarks, tracked by normalised correlation of 15 x 15 px from picture to picture, "
     "there and back, the peak by a paraboloid; F, and so which tracks are kept, estimated from them",
 ]
 REACH_PX = {"pan": 10, "tilt": 10, "general": 24}
-"""How far points may be from where the whole picture's shift leads, after a step and from position to position."""
+"""Largest distance of points from the whole image's shift, after a step and from position to position."""
 NAMES = ("left", "right")
 
 
 def mountain_body(cell: SyntheticCell, rng: np.random.Generator) -> TexturedBody:
-    """Textured rocks that rise away from the head, each with a slope of its own."""
+    """Textured rocks that rise away from the head, each with its own slope."""
     to_camera = _camera(cell, 0, cell.home).centre - cell.body.mean(axis=0)
     away = -np.array([to_camera[0], to_camera[1], 0.0])
     away /= np.linalg.norm(away)
@@ -329,9 +329,9 @@ def mountain_body(cell: SyntheticCell, rng: np.random.Generator) -> TexturedBody
 
 
 def head_before_pictures(rng: np.random.Generator, positions: int) -> SeenHead:
-    """A head before a rendered mountain, its trajectories and so many general ``positions`` tracked from the corner.
+    """A head before a rendered mountain; both trajectories and ``positions`` general positions tracked from the corner.
 
-    Raises DriverError where too few interest points are matched.
+    Raises DriverError if too few interest points are matched.
     """
     cell = head(rng)
     body = mountain_body(cell, rng)
@@ -366,8 +366,8 @@ def head_before_pictures(rng: np.random.Generator, positions: int) -> SeenHead:
 
 
 def on_epipolar_lines(pixels: FloatArray) -> BoolArray:
-    """(m,): which of the points, tracked to ``pixels`` (2, s, m, 2), keep to the epipolar geometry that the others
-    show, within ``EPIPOLAR_PX`` in all pictures. Raises GeometryError.
+    """Mask (m,) of the points, tracked to ``pixels`` (2, s, m, 2), that agree with the epipolar geometry of the others
+    within ``EPIPOLAR_PX`` in all images. Raises GeometryError.
     """
     left, right = pixels.reshape(2, -1, 2)
     F, _ = fundamental_robust(left, right, SIGMA)
@@ -387,12 +387,12 @@ def _picture(cell: SyntheticCell, body: TexturedBody, c: int, q: FloatArray, rng
 # -- the experiment --------------------------------------------------------------------------------------------
 
 POSITIONS, PAIRS = 9, 35
-"""General positions, and pairs of them that are predicted (fig. 4.9): one pair of the 36 is left out."""
+"""General positions, and predicted pairs of them (fig. 4.9): one pair of the 36 is omitted."""
 CONDITIONS = ("pan calibration", "tilt calibration", "feed-forward")
 NOISES: tuple[Noise, ...] = ("drifting", "independent")
 MEASURES = ("delta_u_mean", "delta_u_sd", "delta_v_mean", "delta_v_sd", "delta_l", "delta_r", "delta_lr")
 EDGES, DISTANCES = np.linspace(-3.0, 3.0, 61), np.linspace(0.0, 4.0, 41)
-"""[px], of the histograms."""
+"""Bin edges of the histograms [px]."""
 FEED_FORWARD = {
     "delta_u_mean": -0.04,
     "delta_u_sd": 0.73,
@@ -434,14 +434,15 @@ def step_errors(
     target: FloatArray,
     pairs: list[tuple[int, int]],
 ) -> FloatArray:
-    """Predicted less extracted pixels (pairs, c, m, 2) [px]: from ``pixels`` (c, s, m, 2) of one image to ``target`` of
+    """Predicted minus extracted pixels (pairs, c, m, 2) [px]: from ``pixels`` (c, s, m, 2) of one image to ``target``
+    of
     the other.
     """
     return np.array([feed_forward(seen, positions[i], pixels[:, i], positions[j])[0] - target[:, j] for i, j in pairs])
 
 
 def measures(errors: FloatArray) -> dict[str, float]:
-    """Mean and deviation of Δu and Δv, mean distances Δ_L, Δ_R, Δ_LR (4.5.2) of errors (..., c, m, 2) [px]."""
+    """Mean and standard deviation of Δu and Δv, mean distances Δ_L, Δ_R, Δ_LR (4.5.2) of errors (..., c, m, 2) [px]."""
     distances = np.linalg.norm(errors, axis=-1)
     left, right = np.moveaxis(distances, -2, 0)
     return {
@@ -466,7 +467,7 @@ def trial(cell: SyntheticCell, noise: Noise, rng: np.random.Generator) -> dict[s
 
 
 def errors_of(seen: SeenHead, calibrating: int) -> dict[str, dict[str, FloatArray]]:
-    """The errors of `trial` of what a head saw, of which the first ``calibrating`` points calibrate."""
+    """The errors of `trial` for a head's observations; its first ``calibrating`` points are for calibration."""
     trials = trial_data(seen.cell, seen.tracks, calibrating)
     heads = {
         "calibrated": calibrated(trials).seen,
@@ -482,9 +483,8 @@ def errors_of(seen: SeenHead, calibrating: int) -> dict[str, dict[str, FloatArra
 
 
 def by_pictures(rng: np.random.Generator) -> list[dict[str, Any]]:
-    """The same through rendered pictures: a row a condition, with the tracker's error between consecutive pictures and
-    what it has drifted by at the end of the pan trajectory, rms [px]. Raises DriverError, CalibrationError,
-    GeometryError.
+    """The same with rendered images: one row per condition, with the tracker's rms error between consecutive images and
+    its drift at the end of the pan trajectory [px]. Raises DriverError, CalibrationError, GeometryError.
     """
     seen = head_before_pictures(rng, POSITIONS)
     off = seen.tracks.pan - seen.tracks.pan_exact
@@ -537,8 +537,7 @@ def feed_forward(
     seen: SeenChain, q_from: FloatArray, pixels: FloatArray, q_to: FloatArray, sigma: FloatArray | float = 1.0
 ) -> FloatArray:
     """Predicted raw pixels (s, c, m, 2) at configurations ``q_to`` (s, n) of points seen at ``pixels`` (c, m, 2) in
-    ``q_from`` (n,): reconstructed, displaced by the joints (4.44), projected. NaN where two cameras do not see a
-    point.
+    ``q_from`` (n,): reconstructed, displaced by the joints (4.44), projected. NaN if two cameras do not see a point.
     """
     points, _ = points_seen(seen, q_from, pixels, sigma)
     return predicted_pixels(seen, np.atleast_2d(q_to), points)
@@ -621,7 +620,7 @@ def _path_lengths(cell: SyntheticCell) -> tuple[float, float]:
 
 
 def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
-    """Table 4.1 beside our medians with drifting tracks, as the thesis's are."""
+    """Table 4.1 beside our medians with drifting tracks, like the thesis's."""
     names = {"delta_u_sd": "deviation of Δu", "delta_v_sd": "deviation of Δv", "delta_lr": "Δ_LR"}
     found = []
     for row in answer["rows"]:
@@ -661,7 +660,7 @@ def compare_pan_tilt(answer: dict[str, Any]) -> list[Comparison]:
 
 
 def _compared_pictures(answer: dict[str, Any]) -> list[Comparison]:
-    """Table 4.1, fig. 4.9 and the tracker of 4.5.1 beside what is had through pictures, the largest of all heads."""
+    """Table 4.1, fig. 4.9 and the tracker of 4.5.1 beside ours with rendered images, the largest of all heads."""
     rows = answer["rendered"]
     largest = {
         condition: max(row["delta_lr"] for row in rows if row["condition"] == condition) for condition in CONDITIONS
@@ -706,7 +705,7 @@ def draw_pan_tilt(answer: dict[str, Any]) -> Figures:
 
 
 def show_pan_tilt(answer: dict[str, Any], console: Console) -> None:
-    """Table 4.1 with medians over seeds, one table a noise; the thesis's figures in brackets."""
+    """Table 4.1 with medians over seeds, one table per noise; the thesis's figures in brackets."""
     measures = {
         "delta_u_mean": "u, mean",
         "delta_u_sd": "u, deviation",

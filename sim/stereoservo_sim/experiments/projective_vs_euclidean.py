@@ -50,7 +50,7 @@ def run_projective_vs_euclidean(
     levels: tuple[tuple[float, float], ...] = LEVELS,
     jobs: int | None = None,
 ) -> dict[str, Any]:
-    """``seeds`` tasks by both laws with every model. Raises CalibrationError."""
+    """Run ``seeds`` tasks by both laws with every model. Raises CalibrationError."""
     tasks = random_tasks(seed, seeds)
     cell = free_cell()
     learnt = self_calibrated("free", cell, NOISE_PX, seed)
@@ -85,7 +85,7 @@ def run_projective_vs_euclidean(
 
 
 def compare_projective_vs_euclidean(answer: dict[str, Any]) -> list[Comparison]:
-    """9.3 asks for the comparison and has no figure; 8.7 saw that exact models overlap."""
+    """Thesis 9.3 asks for the comparison and has no figure; 8.7 observed that exact models overlap."""
     found = []
     for law in LAWS_COMPARED:
         rows = {(row["model"], row["points"], row["focal_error"]): row for row in answer["rows"] if row["law"] == law}

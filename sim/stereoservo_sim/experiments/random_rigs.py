@@ -1,12 +1,11 @@
-"""Experiments: how often self-calibration succeeds, and whether reported accuracy holds, on random rigs, arms, bodies
-and noise (``random-rigs``), behind lenses (``random-lenses``), of arms that are not perfect (``random-mechanics``), and
+"""Experiments: success rate of self-calibration, and correctness of its reported accuracy, on random rigs, arms, bodies
+and noise (``random-rigs``), with lens distortion (``random-lenses``), of imperfect arms (``random-mechanics``), and
 of the shipped arms before their cells' cameras (``shipped-arms``).
 
 Each case is evaluated against the ground truth, which the calibration does not use. *Success*: a model whose
-predictions of held-out configurations are as far from the exact pixels as its own covariance says, and whose stated
-focal lengths and principal point are true within their deviations. *Failure*: a CalibrationError. *Wrong*: a model
-that fails the judge. A range of seeds is continued with another: ``--seed 100 --seeds 100`` are the cases behind
-``--seeds 100``.
+prediction errors of held-out configurations agree with its own covariance, and whose stated focal lengths and principal
+point are true within their standard deviations. *Failure*: a CalibrationError. *Wrong*: a model that fails this test. A
+range of seeds is continued by another: ``--seed 100 --seeds 100`` are the cases after ``--seeds 100``.
 
 Lenses are those of `world.random_cells.random_lenses`: radial terms k1 -0.4 to 0.1 and k2 -0.05 to 0.2, tangential ones
 up to 0.001. Mechanics have noise of 0.01 to 0.5 px and one mechanism each, all joints alike: gear ripple of 0.02 to
@@ -67,11 +66,11 @@ from stereoservo_sim.world.synthetic import FIRST_MARKER, SyntheticCell
 Outcome = Literal["success", "failure", "wrong"]
 
 TAIL = 1e-6
-"""Probability with which a true model is called wrong, for each of the judge's two questions."""
+"""Probability that a true model is called wrong, for each of the two tests."""
 
 
 PROMISED = 0.995
-"""Share of successes that is asked for."""
+"""Required share of successes."""
 
 
 class Verdict(msgspec.Struct, frozen=True):
@@ -122,9 +121,9 @@ def judged_case(case: RandomCase) -> Verdict:
 def held_out_ratio(case: RandomCase, trials: TrialData, result: CalibrationFit) -> tuple[float, float, float]:
     """Squared errors of held-out pixels over their stated sum, its effective degrees of freedom, the rms error [px].
 
-    With the errors ``L z``, ``z`` standard normal, the sum of squares has mean ``tr LᵀL`` and is taken for a
+    With the errors ``L z``, ``z`` standard normal, the sum of squares has mean ``tr LᵀL`` and is approximated by a
     chi-square of ``(tr LᵀL)² / tr (LᵀL)²`` degrees of freedom of the same mean (Satterthwaite). With cameras on the arm
-    its joints are counted from them.
+    its joints are counted from the cameras.
     """
     positions = order = case.held_out()
     if case.cell.mount == "eye_in_hand":
@@ -246,10 +245,10 @@ def notes_random_rigs(answer: dict[str, Any]) -> Iterator[str]:
         yield f"case {case['seed']}: {case['outcome']} {case['code']} {case['message']}"
 
 
-# -- behind lenses ---------------------------------------------------------------------------------------------
+# -- lens distortion -------------------------------------------------------------------------------------------
 
 BENDS = ((-0.4, -0.2), (-0.2, -0.05), (-0.05, 0.1))
-"""Ranges of k1 that the rows are of."""
+"""Ranges of k1 of the rows."""
 
 
 def run_random_lenses(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
@@ -323,11 +322,11 @@ def notes_random_lenses(answer: dict[str, Any]) -> Iterator[str]:
 # -- shipped arms ----------------------------------------------------------------------------------------------
 
 AROUND = {"revolute": 0.2, "prismatic": 0.05}
-"""How far from the cell's base the drawn configuration may be [rad or m]."""
+"""Largest distance of the drawn configuration from the cell's base [rad or m]."""
 
 
 def run_shipped_arms(seeds: int, cell: str = "", seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1`` of every shipped arm, or of ``cell`` alone: rows, and what is no success.
+    """Cases ``seed`` to ``seed + seeds - 1`` of every shipped arm, or of ``cell`` alone: rows, and all that fail.
 
     Raises ExperimentError for a cell that is not one of these, ValueError for fewer than one case.
     """
@@ -378,7 +377,7 @@ def arm_case(name: str, seed: int) -> RandomCase:
 
 
 def twin(cell: SimulatedCell, home: FloatArray) -> SyntheticCell:
-    """The cell around ``home`` (n,) as a synthetic one: the same pixels of the same markers, hidden or not."""
+    """The cell around ``home`` (n,) as a synthetic one: the same pixels of the same markers, visible or not."""
     stands = cell.stand is None
     in_rig = cell.rig.world_to_rig if cell.stand is None else inverse_pose(cell.stand)
     poses = [
@@ -407,30 +406,32 @@ def _cell(name: str) -> SimulatedCell:
 
 
 def notes_shipped_arms(answer: dict[str, Any]) -> Iterator[str]:
-    """What failed."""
+    """The failed cases."""
     for case in answer["not_successes"]:
         yield f"{case['arm']}, seed {case['seed']}: {case['outcome']} {case['code']} {case['message']}"
 
 
-# -- arms that are not perfect ---------------------------------------------------------------------------------
+# -- imperfect arms --------------------------------------------------------------------------------------------
 
 MECHANICS_NOISES = (0.01, 0.5)
-"""[px], log-uniform."""
+"""Range of the noise [px], log-uniform."""
 MECHANISMS = ("ripple", "encoder", "play", "sag", "coupling")
-"""The mechanism of seed k is the one at k modulo their number."""
+"""Mechanism of seed k: the one at k modulo their number."""
 TOGETHER = 16
-"""Stops of all joints at once, as a cell file has by default."""
+"""Stops of all joints at once, the default of a cell file."""
 INSIDE = 5.991
 """Squared distance that holds 95 % of two Gaussian coordinates."""
 WELL = 0.85
-"""Share inside their ellipses below which a model must not be called good."""
+"""Least share inside their ellipses of a good model."""
 
 
 class MechanicsVerdict(msgspec.Struct, frozen=True):
-    """Outcome of a case: ``size`` of its mechanism [rad or share], ``inside``: share of unseen markers inside their
-    95 % ellipses, ``code`` and ``message`` of a refusal. ``over_told``: error of these markers over that of a fit which
-    is told where the joints stood in the trials, a perfect arm's, and ``seconds_told`` of its CPU beside ``seconds`` of
-    ours; 0 where it fails.
+    """Outcome of a case: ``size`` of its mechanism [rad or share], ``inside``: share of held-out markers inside their
+    95 % ellipses, ``code`` and ``message`` of a refusal.
+
+    ``over_told``: ratio of the error of these markers to that of a fit given the true joints in the trials (of a
+    perfect
+    arm), and ``seconds_told`` of its CPU time beside our ``seconds``; 0 if it fails.
     """
 
     seed: int
@@ -499,15 +500,15 @@ def judged_mechanics(seed: int) -> MechanicsVerdict:
 
 
 def simulated_trials(case: RandomCase, gears: Sequence[Mechanics], sigma: float) -> TrialData:
-    """Trial motions of a case whose joints have these ``gears``, with noise ``sigma`` [px]."""
+    """Trials of a case whose joints have these ``gears``, with noise ``sigma`` [px]."""
     rng = np.random.default_rng([case.seed, 1])
     trials = mechanical_trials(case.cell, gears, sigma, rng, positions=driven_stops(case))
     return hidden_out_of_view(case.cell, trials)
 
 
 def _told(case: RandomCase, gears: tuple[Mechanics, ...], sigma: float) -> tuple[float, float]:
-    """Error of unseen markers [px], at what joints with these ``gears`` report there, of a fit that is told where they
-    stood in the trials: of a perfect arm's, with the same noise; and its CPU time [s]. Zeros where it fails.
+    """Error [px] of held-out markers, at reported joints with these ``gears``, of a fit given the true joints of the
+    trials (of a perfect arm, with the same noise); and its CPU time [s]. Zeros if it fails.
     """
     trials = simulated_trials(case, (Mechanics(),) * len(gears), sigma)
     begin = time.process_time()
@@ -520,8 +521,8 @@ def _told(case: RandomCase, gears: tuple[Mechanics, ...], sigma: float) -> tuple
 
 
 def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
-    """Positions (s, n) of the case's trials and the joint (s,) that moves, as the trial programme drives them: each
-    joint from its base to one end, then beyond the base to the other; at last all at once (-1), where enough markers
+    """Positions (s, n) of the case's trials and the joint (s,) that moves, as driven by the calibration motion: each
+    joint from its base to one end, then beyond the base to the other; finally all at once (-1), if enough markers
     stay in view.
     """
     home, ranges = case.cell.home, case.cell.ranges
@@ -546,8 +547,8 @@ def driven_stops(case: RandomCase) -> tuple[FloatArray, IntArray]:
 
 
 def unseen(case: RandomCase, gears: tuple[Mechanics, ...], model: CellModel) -> tuple[float, float]:
-    """Root mean square error [px] of the markers in view, at what joints report at poses that the trials have not seen,
-    and their share inside the ellipses that the model states for them.
+    """Root mean square error [px] of the markers in view, at reported joints in held-out poses, and their share inside
+    the ellipses stated by the model.
     """
     links, readings = links_and_readings(case.cell, gears, case.held_out())
     kept = [i - FIRST_MARKER for i in model.marker_ids]
@@ -609,7 +610,7 @@ def draw_random_mechanics(answer: dict[str, Any]) -> Figures:
 
 
 def notes_random_mechanics(answer: dict[str, Any]) -> Iterator[str]:
-    """Counts, every refused case, and every one that is called good and is not."""
+    """Counts, every refused case, and every one that is falsely called good."""
     causes = ", ".join(f"{code} {count}" for code, count in sorted(answer["refused_by_cause"].items()))
     yield (
         f"{answer['usable']} of {answer['seeds']} usable ({answer['usable_low']:.1%} to {answer['usable_high']:.1%})"

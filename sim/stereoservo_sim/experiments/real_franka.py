@@ -1,8 +1,8 @@
 """Experiment with real images: fixed uncalibrated cameras, calibrated from a real arm's recorded displacements
 alone.
 
-A tag on the hand is found in the images; the product's fit takes the arm's poses as those of a free arm
-(`calibration.known_arm`), and its model predicts poses that it has not seen, with the covariance of what it predicts.
+A tag on the hand is found in the images. The product's fit takes the arm's poses as those of a free arm
+(`calibration.known_arm`), and its model predicts held-out poses, with the covariance of the prediction.
 Folds are fixed: pose index modulo FOLDS is held out. The error is the distance of a predicted corner from the measured
 one [px], over *all* held-out corners.
 """
@@ -63,26 +63,24 @@ GreyImage = npt.NDArray[np.uint8]
 FOLDS = 5
 TABLE_TAGS = (0, 2, 3)
 FEW_POSES, SUBSETS = 12, 10
-"""Poses of a small training set, and how many such sets are drawn by default."""
+"""Poses of a small training set, and default number of such sets."""
 INSIDE = 0.95
-"""Probability of the ellipses that held-out corners are counted in."""
+"""Probability of the ellipses in which held-out corners are counted."""
 FAR = 4.0
-"""Deviations beyond which a corner is far from where it was predicted."""
+"""Standard deviations beyond which a corner is far from its prediction."""
 OPENCV_SIGMA = 0.3
-"""Deviation [px] that is stated for cv2's subpixel corners; the fit estimates it where it is larger."""
+"""Standard deviation [px] stated for cv2's subpixel corners; the fit estimates a larger one."""
 STILL_PX, STILL_M = 3.0, 0.05
 """A tag that moves by less in every image while the hand moves by more is not on the hand."""
 
 
 @dataclass(frozen=True)
 class Observations:
-    """Detections in the images. ``camera`` (v,) indexes ``cameras``; ``pose`` (v,) is the pose index of the file
-    names.
+    """Detections in the images. ``camera`` (v,) indexes ``cameras``; ``pose`` (v,) is the pose index of the file names.
 
     ``pixels`` (v, 4, 2) registered corners with ``sigmas`` (v, 4), ``start`` (v, 4, 2) those of cv2's subpixel
     refinement [px].
-    ``backgrounds``: the median image of each camera; ``standing``: table tags found there, corners (4, 2) by
-    id.
+    ``backgrounds``: the median image of each camera; ``standing``: table tags found there, corners (4, 2) by id.
     """
 
     cameras: list[int]
@@ -101,7 +99,7 @@ class Observations:
 @dataclass(frozen=True)
 class PoseViews:
     """The arm's poses ``positions`` (n, 6), as those of a free arm of ``generators`` (6, 4, 4) whose zero is the
-    displacement ``zero`` (4, 4), and the tag's corners there, ``pixels`` (c, n, 4, 2) and ``sigmas`` (c, n, 4) [px].
+    displacement ``zero`` (4, 4), and the tag's corners at them, ``pixels`` (c, n, 4, 2) and ``sigmas`` (c, n, 4) [px].
     """
 
     cameras: tuple[TrialCamera, ...]
@@ -113,7 +111,7 @@ class PoseViews:
     sigmas: FloatArray
 
     def trials(self, stops: BoolArray) -> tuple[TrialData, IntArray]:
-        """Trial data of the poses where ``stops`` (n,) holds, and the cameras that show the tag in enough of them."""
+        """Trial data of the poses selected by ``stops`` (n,), and the cameras that show the tag in enough of them."""
         shown = np.isfinite(self.pixels).all(axis=(2, 3))
         kept = np.flatnonzero((shown & stops).sum(axis=1) >= LEAST_VIEWS)
         if len(kept) < 2:
@@ -150,7 +148,7 @@ class PoseFit:
     views: PoseViews
 
     def predict(self) -> tuple[FloatArray, FloatArray]:
-        """Predicted pixels (c, n, 4, 2) at all poses, and the covariances (c, n, 4, 2, 2) of what is measured there;
+        """Predicted pixels (c, n, 4, 2) at all poses, and the covariances (c, n, 4, 2, 2) of measurements there;
         NaN for cameras that were not kept.
         """
         pixels = np.full(self.views.pixels.shape, np.nan)
@@ -188,8 +186,8 @@ class PoseFit:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Held-out ``errors`` (c, n, 4, 2) [px], predicted less measured, and ``squares`` (c, n, 4) of them in the
-    deviations that were predicted; NaN where nothing was. ``deviations`` (c, n, 4) [px], an axis. ``fits`` by fold.
+    """Held-out ``errors`` (c, n, 4, 2) [px], predicted minus measured, and their ``squares`` (c, n, 4) normalised by
+    the predicted covariances; NaN without prediction. ``deviations`` (c, n, 4) [px], per axis. ``fits`` by fold.
     """
 
     errors: FloatArray
@@ -198,21 +196,21 @@ class HeldOut:
     fits: tuple[tuple[int, PoseFit], ...] = ()
 
     def over(self, other: HeldOut) -> HeldOut:
-        """These, and those of an ``other`` where there are none."""
+        """These, with missing ones taken from ``other``."""
         names = ("errors", "squares", "deviations")
         pairs = ((getattr(self, name), getattr(other, name)) for name in names)
         return HeldOut(*(np.where(np.isfinite(own), own, others) for own, others in pairs))
 
     @property
     def distances(self) -> FloatArray:
-        """Distances (k,) [px] of the corners that were predicted."""
+        """Distances (k,) [px] of the predicted corners."""
         return np.asarray(np.linalg.norm(self.errors[np.isfinite(self.squares)], axis=1))
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """How many of ``corners`` in ``views`` lie inside their ``INSIDE`` ellipses, the 99 % interval of that share where
-    the corners of a view err together, and the largest distance in predicted deviations.
+    """Number of ``corners`` in ``views`` inside their ``INSIDE`` ellipses, the 99 % interval of that share with
+    correlated corners of a view, and the largest distance in predicted standard deviations.
     """
 
     corners: int
@@ -225,7 +223,7 @@ class Coverage:
 
 @dataclass(frozen=True)
 class FewPoses:
-    """A training set of ``FEW_POSES`` poses: its ``seed``, how the rest is predicted; or why it was ``refused``."""
+    """A training set of ``FEW_POSES`` poses: its ``seed``, the prediction of the others; or why it was ``refused``."""
 
     seed: int
     poses: tuple[int, ...]
@@ -250,7 +248,7 @@ class Triangulated:
 
 @dataclass(frozen=True)
 class RealFrankaResult:
-    """Everything that report and plots need. ``variants``: held-out poses by other lenses and other corners;
+    """All data for report and plots. ``variants``: held-out poses by other lenses and other corners;
     ``indices`` (n,) of the poses.
     """
 
@@ -277,10 +275,10 @@ def run_real_franka(
     seed: int = 0,
     progress: ProgressCall | None = None,
 ) -> RealFrankaResult:
-    """Detect, fit, predict. ``progress`` is called with (stage, done, total). ``seed`` is the first of those that draw
+    """Detect, fit, predict. ``progress`` is called with (stage, done, total). ``seed``: first of the seeds that draw
     ``few_sets`` small training sets.
 
-    Raises ExperimentError: what :func:`load_hand_eye_set` raises, the codes of the fit, ``tag_id``, ``image``,
+    Raises ExperimentError: the errors of :func:`load_hand_eye_set`, the codes of the fit, ``tag_id``, ``image``,
     ``image_size``, ``tag_not_seen``, ``tag_stands_still``, ``too_few_poses``.
     """
     for tag in (hand_tag, *table_tags):
@@ -382,7 +380,7 @@ def observe(data: HandEyeSet, hand_tag: int, table_tags: tuple[int, ...], progre
 
 
 def _check_that_tag_follows(seen: Observations, hand_tag: int, displacements: FloatArray) -> None:
-    """Raise ``tag_stands_still`` where the hand moved, by ``displacements`` (v, 4, 4), but the tag did not, in any
+    """Raise ``tag_stands_still`` if the hand moved, by ``displacements`` (v, 4, 4), but the tag did not, in any
     camera.
     """
     middles = seen.pixels.mean(axis=1)
@@ -406,7 +404,7 @@ def fit_poses(
     standing: list[dict[int, FloatArray]] | None = None,
     table_tags: tuple[int, ...] = (),
 ) -> PoseFit:
-    """The product's fit to the poses where ``stops`` (n,) holds; ``standing``: corners of ``table_tags`` by camera,
+    """The product's fit to the poses selected by ``stops`` (n,); ``standing``: corners of ``table_tags`` by camera,
     which become static points.
 
     Raises CalibrationError, and ExperimentError (``too_few_poses``).
@@ -418,7 +416,7 @@ def fit_poses(
 
 
 def _static(standing: list[dict[int, FloatArray]], tags: tuple[int, ...], sigma: float) -> StaticObservations | None:
-    """Corners of tags that stand still, each a marker: STANDING plus four times the tag's id, plus its number."""
+    """Corners of static tags as markers with ids STANDING plus four times the tag's id, plus the corner's number."""
     found = [tag for tag in tags if any(tag in camera for camera in standing)]
     if not found:
         return None
@@ -429,9 +427,9 @@ def _static(standing: list[dict[int, FloatArray]], tags: tuple[int, ...], sigma:
 
 
 def cross_validate(views: PoseViews, fold: IntArray, options: FitOptions | None = None) -> HeldOut:
-    """Each fold (n,) predicted from the others; what no fold could predict stays NaN.
+    """Prediction of each fold (n,) from the others; NaN if no fold could predict it.
 
-    Raises CalibrationError, and ExperimentError (``too_few_poses``) where nothing could be predicted.
+    Raises CalibrationError, and ExperimentError (``too_few_poses``) if nothing could be predicted.
     """
     whole: HeldOut | None = None
     fits = []
@@ -451,7 +449,7 @@ def cross_validate(views: PoseViews, fold: IntArray, options: FitOptions | None 
 
 
 def judged(fitted: PoseFit, out: BoolArray) -> HeldOut:
-    """How a fit predicts the poses where ``out`` (n,) holds."""
+    """Prediction of a fit at the poses selected by ``out`` (n,)."""
     pixels, covariances = fitted.predict()
     errors = pixels - fitted.views.pixels
     errors[:, ~out] = np.nan
@@ -463,8 +461,9 @@ def judged(fitted: PoseFit, out: BoolArray) -> HeldOut:
 
 
 def coverage(held: HeldOut) -> Coverage:
-    """How the predicted covariances hold. Corners of one view share the error of the arm's pose: a share of them has
-    the scatter of as many trials as there are views, at most.
+    """Validity of the predicted covariances. Corners of one view share the error of the arm's pose: the scatter of
+    their
+    share is at most that of as many trials as there are views.
     """
     known = np.isfinite(held.squares)
     squares, count = held.squares[known], int(known.any(axis=2).sum())
@@ -481,7 +480,7 @@ def coverage(held: HeldOut) -> Coverage:
 
 
 def _variants(views: PoseViews, opencv: PoseViews, fold: IntArray) -> dict[str, HeldOut]:
-    """Held-out poses by lenses that are not left to the data, and by cv2's corners."""
+    """Held-out poses by lenses not left to the data, and by cv2's corners."""
     pinhole = FitOptions(lens="none")
     wanted: dict[str, Callable[[], HeldOut]] = {
         "no lens": lambda: cross_validate(views, fold, pinhole),
@@ -492,7 +491,7 @@ def _variants(views: PoseViews, opencv: PoseViews, fold: IntArray) -> dict[str, 
 
 
 def _from_few_poses(views: PoseViews, indices: IntArray, seed: int) -> FewPoses:
-    """All other poses predicted from FEW_POSES that a seed draws."""
+    """Prediction of all other poses from FEW_POSES random ones."""
     n = len(indices)
     chosen = np.random.default_rng(seed).choice(n, min(FEW_POSES, n - 1), replace=False)
     inside = np.isin(np.arange(n), chosen)
@@ -506,7 +505,7 @@ def _from_few_poses(views: PoseViews, indices: IntArray, seed: int) -> FewPoses:
 def triangulation_errors(
     folds: tuple[tuple[int, PoseFit], ...], views: PoseViews, fold: IntArray
 ) -> list[Triangulated]:
-    """Each set of two or more of the cameras that every fold fitted, the largest set last; corners of held-out poses in
+    """Each set of two or more of the cameras fitted in every fold, the largest set last; corners of held-out poses in
     which all these cameras saw the tag.
     """
     if not folds:
@@ -545,7 +544,7 @@ REFERENCE = {
     "corners": "cv2 CORNER_REFINE_SUBPIX, no radial term",
     "data": "fairo_franka/set_a, hand tag 9",
 }
-"""Measured before on that set; beside other sets it is only a scale."""
+"""Former measurements on that set; for other sets they are only a scale."""
 
 THESIS = {
     "rms_px": [0.09, 0.16],
@@ -634,7 +633,7 @@ def report_real_franka(result: RealFrankaResult) -> dict[str, Any]:
 
 
 def _uncertainty(held: HeldOut) -> dict[str, Any]:
-    """The predicted deviations of held-out corners, and how they hold."""
+    """The predicted deviations of held-out corners, and their validity."""
     found = coverage(held)
     return {
         "median_px": float(np.nanmedian(held.deviations)),
@@ -649,7 +648,7 @@ def _uncertainty(held: HeldOut) -> dict[str, Any]:
 
 
 def _few_poses(result: RealFrankaResult) -> dict[str, Any]:
-    """How training sets of few poses predict the rest."""
+    """Prediction of the remaining poses by training sets of few poses."""
     rows: list[dict[str, Any]] = []
     for one in result.few:
         rows.append({"seed": one.seed, "poses": list(one.poses)})
@@ -657,7 +656,7 @@ def _few_poses(result: RealFrankaResult) -> dict[str, Any]:
             rows[-1]["refused"] = one.refused
             continue
         rows[-1].update(_figures(one.held_out, result), **_uncertainty(one.held_out))
-        del rows[-1]["not_predicted"]  # the poses learnt from are among them
+        del rows[-1]["not_predicted"]  # the training poses are among them
     told = [one for one in rows if "corners" in one]
     return {
         "poses": FEW_POSES,
@@ -676,7 +675,7 @@ def _names(result: RealFrankaResult, cameras: list[int]) -> list[str]:
 
 
 def _figures(held: HeldOut, result: RealFrankaResult) -> dict[str, Any]:
-    """Median, rms and largest distance [px], and per axis, of the corners that were predicted."""
+    """Median, rms and largest distance [px], and per axis, of the predicted corners."""
     known = held.errors[np.isfinite(held.squares)]
     distance = np.linalg.norm(known, axis=1)
     measured = int(np.isfinite(result.views.pixels).all(axis=3).sum())

@@ -37,13 +37,15 @@ from stereoservo_sim.world.synthetic import SyntheticCell, dh_link, flat_plate, 
 SIGMA = 0.05
 """Noise of a dot's centre [px] an axis."""
 IMPLIED_SIGMA, IMPLIED_BASELINE = 0.094, 0.20
-"""Noise [px] an axis that the mean image error of table 5.1 with free points implies (0.117 px is the mean length of
-what is left of it after the fit), and the baseline [m] that 8.6 states for the same robot."""
+"""Noise [px] per axis implied by the mean image error of table 5.1 with free points (0.117 px is the mean length of
+the residual after the fit), and the baseline [m] stated in 8.6 for the same robot.
+"""
 STOPS = 20
-"""Of each joint's stroke, for each position of the plate."""
+"""Stops per stroke of each joint, for each position of the plate."""
 PLATE_TURNS_DEG = (-135.0, -67.5, 0.0, 67.5)
-"""Of the last joint from home, while the others move: 4 dots become 16 rigid points, every 22.5° of a circle (fig.
-5.16). Quarter turns would bring the square onto itself."""
+"""Angles of the last joint from home while the others move: 4 dots become 16 rigid points, every 22.5° of a circle
+(fig. 5.16). Quarter turns would map the square onto itself.
+"""
 ROWS = (
     (0.0, -90.0, 0.42),
     (0.400, 0.0, 0.0),
@@ -56,9 +58,9 @@ ROWS = (
 4; axes 4 and 6 miss each other by 0.3 mm along axis 5. Base height and flange are neither stated nor identifiable."""
 HOME_DEG = (10.0, -60.0, 120.0, 20.0, 40.0, 15.0)
 STROKES_DEG = (8.0, 8.0, 8.0, 30.0, 25.0, 170.0)
-"""Each joint goes from minus to plus this about home."""
+"""Strokes: each joint moves from minus to plus this about home."""
 DISTANCE, BASELINE = 1.3, 0.46
-"""[m] of the plate from the rig, and between the cameras, which look at it."""
+"""Distance of the plate from the rig, and between the cameras, which are aimed at it [m]."""
 SIZE = 512
 """Width and height of the images [px]."""
 
@@ -130,7 +132,7 @@ def thesis_cell(baseline: float = BASELINE) -> SyntheticCell:
 def trial_motions(
     cell: SyntheticCell, stops: int = STOPS, turns_deg: tuple[float, ...] = PLATE_TURNS_DEG
 ) -> tuple[FloatArray, IntArray]:
-    """Positions (s, n) and the joint that moves (s,): strokes, but for the last joint's at each turn of the plate."""
+    """Positions (s, n) and the joint that moves (s,): strokes, except the last joint's, at each angle of the plate."""
     positions, trials = [], []
     last = len(cell.kinds) - 1
     for j in range(last + 1):
@@ -174,7 +176,8 @@ QUANTITIES = (
     TableQuantity("5.4", "link 5", "mm"),
     TableQuantity("5.4", "axes 4, 6", "mm"),
 )
-"""What `tables` gives, in its order. Angle 2, 3 is 0: its two components have a sign and so a Gaussian error."""
+"""Quantities of `tables`, in its order. Angle 2, 3 is 0: its two components are signed, so their errors are Gaussian.
+"""
 
 
 def tables(model: CellModel) -> FloatArray:
@@ -219,8 +222,9 @@ def cramer_rao(cell: SyntheticCell, trials: TrialData) -> FloatArray:
 
 @dataclass(frozen=True)
 class ImageErrors:
-    """Mean image distances (n,) [px] of each axis's trial and what the noise alone gives there, both with the points
-    fixed (5.53) and free (5.55); ``residuals`` (k, 2) [sigmas] of the free ones, ``joint`` (k,)."""
+    """Mean image distances (n,) [px] of each axis's trial and their expectation from noise alone, both with the points
+    fixed (5.53) and free (5.55); ``residuals`` (k, 2) [sigmas] of the free ones, ``joint`` (k,).
+    """
 
     fixed: FloatArray
     fixed_floor: FloatArray
@@ -234,7 +238,7 @@ def image_errors(model: CellModel, trials: TrialData, home: FloatArray, home_pix
     """Table 5.1 of a fitted model: image distances of its trials.
 
     Fixed points are triangulated from one stereo image, ``home_pixels`` (c, m, 2) taken at ``home`` (n,), with the
-    model's cameras; the generators are then fitted to the trials, points and cameras held.
+    model's cameras; then the generators are fitted to the trials with fixed points and cameras.
     """
     parts = framed(model)
     chain = ProjectiveChain(parts.kinds, parts.generators, parts.zero)
@@ -273,8 +277,8 @@ def jacobian_at(rig: RigModel, data: Measurements, *, cameras: bool = True, poin
 
 
 def _points_noise(rig: RigModel, data: Measurements, sigmas: FloatArray) -> FloatArray:
-    """Derivative of the residuals by the noise of points triangulated at the rig's zero from pixels with ``sigmas``
-    (c, m).
+    """Derivative of the residuals with respect to the noise of points triangulated at the rig's zero from pixels with
+    ``sigmas`` (c, m).
 
     Columns (2 k, 3 m), one standard deviation each.
     """
@@ -289,8 +293,9 @@ def _points_noise(rig: RigModel, data: Measurements, sigmas: FloatArray) -> Floa
 
 
 def _remaining(jacobian: FloatArray, disturbance: FloatArray | None = None) -> FloatArray:
-    """Covariances (k, 2, 2) [sigmas²] of the residuals that a fit by ``jacobian`` (2 k, p) leaves of unit noise, and of
-    a ``disturbance`` (2 k, r) of one standard deviation a column."""
+    """Covariances (k, 2, 2) [sigmas²] of the residuals of a fit by ``jacobian`` (2 k, p) to unit noise, and to
+    a ``disturbance`` (2 k, r) of one standard deviation per column.
+    """
     basis = np.linalg.qr(jacobian)[0]
     rows = basis.reshape(-1, 2, basis.shape[1])
     result: FloatArray = np.eye(2) - rows @ rows.transpose(0, 2, 1)
@@ -369,7 +374,7 @@ def simulate(
 BINS = np.linspace(-4.0, 4.0, 41)
 """Edges of the residual histograms [sigmas]."""
 TAIL = 0.005
-"""Of each side of the chi-square interval of 1 %."""
+"""Tail probability on each side of the chi-square interval of 99 %."""
 PARTS_OF_AXES_2_3 = ("axes 2, 3 about their normal", "axes 2, 3 in their plane")
 
 
@@ -380,8 +385,9 @@ def run_robot(seeds: int = 30, seed: int = 0, progress: ProgressCall = lambda *_
 
 
 def answer(runs: RobotRuns, implied: RobotRuns) -> dict[str, Any]:
-    """The JSON object of ``reproduce robot``: ``rows`` of the cameras and the noise that are assumed, ``implied`` of
-    those that the thesis implies."""
+    """The JSON object of ``reproduce robot``: ``rows`` with the assumed cameras and noise, ``implied`` with
+    those implied by the thesis.
+    """
     positions, _ = trial_motions(runs.cell)
     images = len(positions) * len(runs.cell.poses)
     return {
@@ -471,7 +477,7 @@ def _clean(value: float) -> float:
 
 
 def _thesis_values(table: str, name: str) -> tuple[Any, Any]:
-    """Published reference (factory or off-line) value and the experiment's, None where the thesis has none."""
+    """Published reference (factory or off-line) value and the experiment's, None if the thesis has none."""
     if table == "5.2":
         side, part = name.split()
         return tuple(THESIS["5.2"][side].get(part, (None, None)))
@@ -479,7 +485,7 @@ def _thesis_values(table: str, name: str) -> tuple[Any, Any]:
 
 
 def compare_robot(answer: dict[str, Any]) -> list[Comparison]:
-    """Tables 5.1 to 5.4 beside our errors with the noise and the baseline that the thesis implies."""
+    """Tables 5.1 to 5.4 beside our errors with the noise and the baseline implied by the thesis."""
     implied, seeds = answer["implied"], answer["seeds"]
     setting = f"{implied['sigma_px']:g} px, baseline {100 * implied['baseline_m']:.0f} cm"
     found = [

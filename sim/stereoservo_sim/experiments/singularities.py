@@ -1,9 +1,9 @@
 """Experiment: goals from starts near the singularities of an arm with a spherical wrist, by every law in the servo
 core: wrist, elbow and shoulder, exactly there and within half a degree.
 
-Each case is one start before the cameras, drawn by its seed, and one goal in pictures, up to a fifth of a radian away
-in all joints; the model is the true one. A case counts for a law where `stereo` or `trajectory` reaches it. A range of
-seeds is continued with another.
+Each case has one start before the cameras, drawn by its seed, and one goal in images, up to a fifth of a radian away
+in all joints; the model is the true one. A case counts for a law if `stereo` or `trajectory` reaches it. A range of
+seeds is continued by another.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ REFERENCES = ("stereo", "trajectory")
 Kind = Literal["wrist", "elbow", "shoulder"]
 KINDS: tuple[Kind, ...] = ("wrist", "elbow", "shoulder")
 NEAR = np.deg2rad(0.5)
-"""[rad] Of the joint that makes the arm singular; every third case is exactly there."""
+"""Largest distance from the singularity of the joint concerned [rad]; every third case is exactly singular."""
 AWAY = 0.2
-"""[rad] Of every joint from start to goal, at most."""
+"""Largest distance of every joint from start to goal [rad]."""
 NOISE_PX = 0.05
 TIME_LIMIT_S = 40.0
 DRAWS = 400
@@ -52,7 +52,7 @@ class SingularVerdict(msgspec.Struct, frozen=True):
 
 
 def singular_case(seed: int) -> tuple[SyntheticCell, FloatArray, FloatArray, float]:
-    """Cell, start and goal (6,) of ``seed``, and how far [rad] the start is from the singularity."""
+    """Cell, start and goal (6,) of ``seed``, and the start's distance [rad] from the singularity."""
     rng = np.random.default_rng([seed, 8])
     kind = KINDS[seed % len(KINDS)]
     offset = 0.0 if (seed // len(KINDS)) % 3 == 0 else float(rng.uniform(-NEAR, NEAR))
@@ -104,8 +104,8 @@ def judged_singular(seed: int, laws: tuple[str, ...] = LAWS) -> list[SingularVer
 
 
 def run_singularities(seeds: int, seed: int = 0, progress: ProgressCall = silent) -> dict[str, Any]:
-    """Cases ``seed`` to ``seed + seeds - 1``: for each law and kind how many are reached of those that one of the
-    references reaches, how many end by the time limit, and every one that the law does not reach of them.
+    """Cases ``seed`` to ``seed + seeds - 1``, for each law and kind: number reached of those that one of the
+    references reaches, number that end by the time limit, and every one of them that the law does not reach.
     """
     verdicts = [verdict for found in cases(judged_singular, seeds, seed, progress) for verdict in found]
     possible = {v.seed for v in verdicts if v.law in REFERENCES and v.outcome == "reached"}
@@ -140,7 +140,7 @@ def run_singularities(seeds: int, seed: int = 0, progress: ProgressCall = silent
 
 
 draw_singularities = drawing_sorted("singularities", "seconds", "time to the goal [s]")
-"""How long the goals that are reached take, by law."""
+"""Durations of reached goals, by law."""
 
 
 def notes_singularities(answer: dict[str, Any]) -> Iterator[str]:

@@ -1,6 +1,6 @@
 """Experiment ``tasks-abc`` (8.6, figs 8.6 to 8.12): three alignments with the RX 90 by image-based stereo control,
-self-calibrated projectively or metric with coarse errors; given the markers' pixels, and through rendered pictures,
-calibration and all: what the extraction of the markers does to a run with and without the prediction by the kinematics.
+self-calibrated projectively or metric with coarse errors; from the markers' given pixels, and with rendered images,
+calibration included: effect of marker extraction on a run with and without the prediction by kinematics.
 """
 
 from __future__ import annotations
@@ -52,26 +52,27 @@ from stereoservo_sim.world.camera_rig import PinholeCamera
 from stereoservo_sim.world.rendering import draw_faces
 
 FACE = seven_dots("plate", 0, 0.66, ((0.25, 0.40), (0.66, 0.49)), side=float(np.ptp(MARKERS[:, 0])))
-"""Its corner dots are the tasks' markers; the three others tell which is which."""
+"""The plate's face. Its corner dots are the tasks' markers; the three others identify them."""
 BACKGROUND, BLUR_PX, NOISE_GREY = 60.0, 0.7, 2.0
-"""[grey levels], [px], [grey levels]"""
+"""Background [grey levels], blur [px], noise [grey levels]."""
 NOISE_MARGIN = 64
-"""A frame's noise is a part of one field, shifted by less than this [px]."""
+"""A frame's noise is cut from one field, at offsets below this [px]."""
 PRIOR_PX = 1.0
-"""Standard deviation that the detector is told of what is expected."""
+"""Standard deviation of the prior given to the detector."""
 PERIOD_NS = 40_000_000
 
 
 class PlatePictures:
-    """Sight of the plate (`stereoservo_sim.tasks.closed_loop.PlateSight`) through rendered pictures.
+    """Source of the plate's pixels (`stereoservo_sim.tasks.closed_loop.PlateSight`) by rendered images.
 
-    ``predicts``: the detector is given what the controller expects, and the loop goes on where it finds nothing. Else
+    ``predicts``: the detector is given the controller's expectation, and the loop continues if nothing is found.
+    Otherwise
     it searches the whole images, and has to find all four markers in both.
 
     Attributes:
-        found: how many markers were found in both images, frame by frame.
-        off: how far each of them was off its true image [px].
-        ahead: how far every marker was off where it was expected [px].
+        found: number of markers found in both images, frame by frame.
+        off: distance of each of them from its true pixel [px].
+        ahead: distance of every expected marker from its true pixel [px].
     """
 
     def __init__(self, predicts: bool) -> None:
@@ -91,7 +92,7 @@ class PlatePictures:
     def look(
         self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray] | None:
-        """As `PlateSight` has it."""
+        """See `PlateSight`."""
         if expected is not None:
             self.ahead += np.linalg.norm(expected - sight(pose).pixels, axis=-1).ravel().tolist()
         pixels, seen = self.extracted(pose, expected if self._predicts else None, rng)
@@ -100,7 +101,7 @@ class PlatePictures:
     def extracted(
         self, pose: FloatArray, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """Pixels (c, m, 2) of the markers, and 1 or 0 (c, m) for what was found of them."""
+        """Pixels (c, m, 2) of the markers, and mask (c, m), 1 if found, else 0."""
         truth = sight(pose).pixels
         pixels, seen = np.zeros(truth.shape), np.zeros(truth.shape[:2])
         seq = len(self.found) + 1
@@ -134,7 +135,7 @@ def _detector(camera: str) -> DotDetector:
 
 
 def _prior(camera: str, t_ns: int, expected: FloatArray) -> Prior:
-    """The dots of the face where the four corners are ``expected`` (4, 2) [px]."""
+    """Prior of the face's dots from the four ``expected`` corners (4, 2) [px]."""
     n = len(FACE.ids)
     corners, H = np.arange(n) < len(CORNERS), np.zeros((3, 3))
     dots = np.zeros((n, 2))
@@ -147,10 +148,10 @@ def _prior(camera: str, t_ns: int, expected: FloatArray) -> Prior:
     return prior_at(camera, t_ns, ids, pixels, PRIOR_PX**2)
 
 
-# -- the tasks through pictures --------------------------------------------------------------------------------
+# -- the tasks with rendered images ------------------------------------------------------------------------------
 
 DETECTED_PX = 0.02
-"""[px] an axis, that the fit is told of the markers in the trials' pictures."""
+"""Standard deviation [px] per axis stated to the fit for the markers in the calibration images."""
 HARD = ("B", "projective", True)
 IN_BOTH = 2 * len(MARKERS)
 RUNS = (
@@ -162,7 +163,7 @@ RUNS = (
     ("B", "coarse", True),
     ("C", "projective", True),
 )
-"""Task, calibration, and whether the detector is given what the kinematics predict."""
+"""Task, calibration, and whether the detector is given the prediction by kinematics."""
 COASTS = (
     "the law coasts on its wrong prediction, and the search of the whole image finds the marked dots again once they "
     "lean less; the thesis's four like markers had to be told apart by where they were"
@@ -176,7 +177,7 @@ PICTURES_ASSUMED = [
 
 
 def pictured_calibration(seed: int) -> TaskCalibration:
-    """The RX 90's model learnt from pictures of its trial motions. Raises CalibrationError."""
+    """The RX 90's model learnt from rendered images of its calibration motion. Raises CalibrationError."""
     cell = with_trial_ranges(rx90_cell())
     rng = np.random.default_rng([seed, 20])
     pictures = PlatePictures(predicts=True)
@@ -192,8 +193,8 @@ def pictured_calibration(seed: int) -> TaskCalibration:
 def through_pictures(
     tasks: dict[str, AlignmentTask], settings: LoopSettings
 ) -> tuple[list[dict[str, Any]], FloatArray]:
-    """How each of ``RUNS`` ends, in how many frames the extraction lacked markers, how far predictions were off; and
-    the pose (4, 4) of task B's plate where it is inclined most. Raises CalibrationError.
+    """The end of each of ``RUNS``, number of frames without all markers, errors of predictions; and
+    the pose (4, 4) of task B's plate at its largest inclination. Raises CalibrationError.
     """
     known = {
         "projective": pictured_calibration(settings.seed),
@@ -226,7 +227,7 @@ def through_pictures(
 
 
 def draw_pictures(answer: dict[str, Any]) -> Figure:
-    """The left camera's pictures of start and goal of each task, and of B's plate inclined most (fig. 8.6)."""
+    """The left camera's images of start and goal of each task, and of B's plate at largest inclination (fig. 8.6)."""
     pictures, rng = PlatePictures(predicts=False), np.random.default_rng(0)
     figure = picture(11, 4)
     axes = figure.subplots(2, len(answer["tasks"]) + 1)
@@ -242,7 +243,7 @@ def draw_pictures(answer: dict[str, Any]) -> Figure:
 
 
 def compare_pictures(rows: list[dict[str, Any]]) -> list[Comparison]:
-    """8.6, figs 8.9 and 8.10 beside the runs through pictures."""
+    """Thesis 8.6, figs 8.9 and 8.10 beside the runs with rendered images."""
 
     def run(name: str, calibration: str, predicts: bool) -> dict[str, Any]:
         (found,) = (r for r in rows if (r["task"], r["calibration"], r["prediction"]) == (name, calibration, predicts))
@@ -283,20 +284,20 @@ def _end(row: dict[str, Any]) -> str:
 # -- the experiment --------------------------------------------------------------------------------------------
 
 DRAWN = {"A": (40.0, 0.15), "B": (100.0, 0.10), "C": (60.0, 0.25)}
-"""Angle [°] and distance [m] of the tasks; B is the one with the important rotation of the plate."""
+"""Angle [°] and distance [m] of the tasks; B has the large rotation of the plate."""
 DEPTH_M, DEPTH_SPREAD_M = 1.0, 0.15
 END_FACING = 0.4
-"""Least cosine of the angle at which a camera sees the plate's normal in start and goal: the markers are extracted."""
+"""Least cosine between a camera's line of sight and the plate's normal in start and goal, for marker extraction."""
 STRONG = 0.2
-"""At most so much on the law's way of task B, whose face gets a strong inclination."""
+"""Largest such cosine on the law's path of task B, whose face gets a strong inclination."""
 TRIED_RATE_HZ = 5.0
-"""Of the runs that choose poses."""
+"""Rate of the runs that choose poses."""
 GAINS = (0.25, 0.5, 1.0, 2.0)
-"""[1/s]"""
+"""Gains [1/s]."""
 SHOWN_GAIN = 0.5
 NOISE_PX = 0.1
 FITTED = 0.02
-"""Decay is fitted until this share of the error is left."""
+"""Remaining share of the error down to which its decay is fitted."""
 CALIBRATIONS: dict[str, CalibrationName] = {
     "projective": "self",
     "coarse": "coarse",
@@ -357,7 +358,7 @@ def drawn(rng: np.random.Generator, number: int, seed: int, angle_deg: float, di
 
 
 def run_tasks_abc(*, seeds: int, seed: int, progress: ProgressCall, gains: tuple[float, ...] = GAINS) -> dict[str, Any]:
-    """All tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's
+    """Run all tasks with both calibrations at several gains, and with the mean Jacobian at one; ``seeds`` more of B's
     kind.
 
     Raises CalibrationError.
@@ -408,7 +409,7 @@ def run_tasks_abc(*, seeds: int, seed: int, progress: ProgressCall, gains: tuple
 
 
 def _coarser(level: tuple[float, float], tasks: dict[str, AlignmentTask], seed: int) -> dict[str, Any]:
-    """How the tasks end with a metric model of these focal and hand-eye errors, at ``SHOWN_GAIN``."""
+    """Ends of the tasks with a metric model of these focal and hand-eye errors, at ``SHOWN_GAIN``."""
     model = metric_model("rx90", rx90_cell(), *level)
     settings = _settings("current", SHOWN_GAIN, seed)
     ends = {name: run_task(task, model, settings)[0].reason or "converges" for name, task in tasks.items()}
@@ -416,7 +417,7 @@ def _coarser(level: tuple[float, float], tasks: dict[str, AlignmentTask], seed: 
 
 
 def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
-    """8.6 and figs 8.6 to 8.12: what the thesis saw of the three tasks, beside our runs around the current points."""
+    """Thesis 8.6 and figs 8.6 to 8.12: observations of the three tasks, beside our runs around the current points."""
     rows = [row for row in answer["rows"] if row["jacobian"] == "current"]
 
     def ends(name: str, calibration: str) -> list[dict[str, Any]]:

@@ -1,5 +1,5 @@
-"""Pictures of textured planes and of chessboards, every pixel of which is the image of a known point, and what finds
-points in them: the product's finder of chessboards and its detector of natural features, and a tracker like the
+"""Images of textured planes and of chessboards, in which every pixel is the image of a known point, and methods that
+find points in them: the product's chessboard finder and its detector of natural features, and a tracker like the
 thesis's (4.5.1).
 """
 
@@ -25,12 +25,12 @@ from stereoservo_drivers.detectors.landmarks import encode_landmarks
 from stereoservo_sim.world.camera_rig import PinholeCamera
 
 LAYERS = ((30.0, 1.0), (22.0, 2.5), (14.0, 7.0))
-"""Contrast [grey levels] and coarseness, relative to the finest, of what a texture is made of."""
+"""Contrast [grey levels] and coarseness, relative to the finest, of the layers of a texture."""
 MEAN_GREY, BACKGROUND = 125.0, 60.0
 
 
 def texture(rng: np.random.Generator, side: int = 256, scale: float = 1.6) -> FloatArray:
-    """Grey levels (side, side) without edges finer than ``scale`` texels, and with coarser things among them."""
+    """Grey levels (side, side) without structures finer than ``scale`` texels, and with coarser ones."""
     image = np.full((side, side), MEAN_GREY)
     for contrast, factor in LAYERS:
         field = gaussian_filter(rng.normal(size=(side, side)), scale * factor)
@@ -56,21 +56,23 @@ class Face:
 
 @dataclass(frozen=True, eq=False)
 class TexturedBody:
-    """A body of ``faces``; nearer ones hide those behind, pixel by pixel."""
+    """A body of ``faces``; nearer ones occlude those behind, pixel by pixel."""
 
     faces: Sequence[Face]
 
     def picture(
         self, camera: PinholeCamera, shift: FloatArray, rng: np.random.Generator, noise_grey: float
     ) -> ImageArray:
-        """Image (h, w) with the body moved by ``shift`` (3,) [m], all of it before the camera (ValueError)."""
+        """Image (h, w) with the body moved by ``shift`` (3,) [m]. Raises ValueError unless all of it is before the
+        camera.
+        """
         grey = self._layers(camera, shift)[0]
         grey = grey + rng.normal(0.0, noise_grey, grey.shape)
         return np.asarray(np.clip(np.rint(grey), 0, 255).astype(np.uint8))
 
     def points(self, camera: PinholeCamera, pixels: FloatArray, shift: FloatArray) -> FloatArray:
-        """Points (m, 3) [m] of the body, moved by ``shift`` (3,), that are seen at ``pixels`` (m, 2), NaN where
-        there is background.
+        """Points (m, 3) [m] of the body, moved by ``shift`` (3,), that are seen at ``pixels`` (m, 2); NaN for
+        background.
         """
         _, owner = self._layers(camera, shift)
         u, v = np.rint(pixels).astype(int).T
@@ -85,7 +87,7 @@ class TexturedBody:
         return found
 
     def _layers(self, camera: PinholeCamera, shift: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Grey levels (h, w) and the face that is seen (h, w), -1 for none."""
+        """Grey levels (h, w) and the visible face (h, w), -1 for none."""
         shape = camera.height, camera.width
         image, nearest = np.full(shape, BACKGROUND), np.full(shape, np.inf)
         owner = np.full(shape, -1, np.int64)
@@ -94,7 +96,7 @@ class TexturedBody:
             left, top, right, bottom = _box(H, side, camera)
             v, u = np.mgrid[top:bottom, left:right]
             texel = np.linalg.solve(H, np.stack([u.ravel(), v.ravel(), np.ones(u.size)]))
-            # Of the scaled ray that is the depth of the camera, since K's last row is (0, 0, 1).
+            # For the scaled ray this is the depth in the camera, since K's last row is (0, 0, 1).
             depth = 1.0 / texel[2]
             x, y = texel[:2] / texel[2]
             window = slice(top, bottom), slice(left, right)
@@ -106,7 +108,7 @@ class TexturedBody:
 
 
 def _box(H: FloatArray, side: int, camera: PinholeCamera) -> tuple[int, int, int, int]:
-    """Left, top, right, bottom [px] of the image of a face, right and bottom beyond; of one before the camera."""
+    """Left, top, right, bottom [px] of the image of a face before the camera, right and bottom exclusive."""
     corners = np.array([[0, 0, 1], [side, 0, 1], [side, side, 1], [0, side, 1.0]]) @ H.T
     if corners[:, 2].min() <= 0.0:
         raise ValueError("a face reaches behind the camera; all corners of a textured body must lie before it")
@@ -120,14 +122,14 @@ def _box(H: FloatArray, side: int, camera: PinholeCamera) -> tuple[int, int, int
 # -- chessboards -----------------------------------------------------------------------------------------------
 
 SQUARES, SIDE = 8, 0.025
-"""Squares along a board, and their side [m]."""
+"""Number of squares along a board, and their side [m]."""
 CORNERS = SQUARES - 1
 EDGE, BORDER = 0.005, 0.0125
-"""[m] Of bright border towards the other board, and around."""
+"""Width of the bright border towards the other board, and around [m]."""
 TEXELS, SOFT = 560, 1.2
-"""Along a board, and how soft its edges are [texels]."""
+"""Texels along a board, and softness of its edges [texels]."""
 FINE = 32
-"""Samples of a texel that an edge may cross."""
+"""Samples per texel that contains an edge."""
 BRIGHT, DARK = 205.0, 45.0
 
 
@@ -140,7 +142,7 @@ def board_points(distance: float) -> FloatArray:
 
 
 def boards(distance: float) -> TexturedBody:
-    """Both boards, the common edge ``distance`` [m] ahead, towards the cameras."""
+    """Both boards, the common edge ``distance`` [m] ahead, nearest to the cameras."""
     length, half = EDGE + SQUARES * SIDE + BORDER, np.sqrt(0.5)
     high = 0.5 * SQUARES * SIDE + BORDER
     across, sign_across = _stripes(length, EDGE)
@@ -153,8 +155,9 @@ def boards(distance: float) -> TexturedBody:
 
 
 def _stripes(length: float, begin: float) -> tuple[FloatArray, FloatArray]:
-    """Of each texel along ``length`` [m], of which the squares take a part from ``begin`` on: what share of it they
-    cover, and with which sign, which changes from square to square.
+    """For each texel along ``length`` [m], with squares from ``begin`` on: the share that they cover, and the sign,
+    which
+    alternates from square to square.
     """
     step = length / (TEXELS - 1)
     fine = step * (np.arange(TEXELS)[:, None] + (np.arange(FINE) + 0.5) / FINE - 0.5)
@@ -164,7 +167,7 @@ def _stripes(length: float, begin: float) -> tuple[FloatArray, FloatArray]:
 
 
 def find_boards(image: ImageArray) -> FloatArray | None:
-    """Inner corners (98, 2) [px] of both boards, the left one first, row by row; None where not both are found."""
+    """Inner corners (98, 2) [px] of both boards, the left one first, row by row; None unless both are found."""
     left_over, found = image.copy(), []
     for _ in range(2):
         pixels = find_corners(left_over, CORNERS, CORNERS)
@@ -172,7 +175,7 @@ def find_boards(image: ImageArray) -> FloatArray | None:
             return None
         grid = upright(pixels.reshape(CORNERS, CORNERS, 2))
         found.append(grid)
-        # Corners, continued by a square on every side.
+        # Corners, extrapolated by a square on every side.
         ends = grid[[0, 0, -1, -1], [0, -1, -1, 0]]
         outline = ends + (ends - ends.mean(axis=0)) * (2.0 / (CORNERS - 1))
         cv2.fillConvexPoly(left_over, np.rint(outline).astype(np.int32), int(BRIGHT))
@@ -181,7 +184,7 @@ def find_boards(image: ImageArray) -> FloatArray | None:
 
 
 def upright(grid: FloatArray) -> FloatArray:
-    """The corners (n, n, 2) [px] of a board that stands upright: rows downwards, columns to the right."""
+    """The corners (n, n, 2) [px] of an upright board: rows downwards, columns to the right."""
     along = grid[0, -1] - grid[0, 0]
     if abs(along[1]) > abs(along[0]):
         grid = grid.transpose(1, 0, 2)
@@ -193,15 +196,15 @@ def upright(grid: FloatArray) -> FloatArray:
 # -- a tracker like the thesis's -------------------------------------------------------------------------------
 
 HALF, BACK_REACH = 7, 4
-"""[px] Of a window's side, and how far around where it came from a match is sought back."""
+"""Half the side of a window, and search radius of the reverse match [px]."""
 LEAST_CORRELATION = 0.8
 BACK_PX = 0.5
-"""A point whose match leads back to a place this far off is lost."""
+"""A point whose reverse match is this far from its origin is lost."""
 
 
 def follow(pictures: Sequence[ImageArray], first: FloatArray, reach: int) -> FloatArray:
-    """Pixels (s, m, 2) of points at ``first`` (m, 2) in the first of s pictures, NaN from where a point is lost: where
-    nothing correlates within ``reach`` [px] of the whole picture's shift, or what does leads back to another place.
+    """Pixels (s, m, 2) of points at ``first`` (m, 2) in the first of s images, NaN from the image in which a point is
+    lost: nothing correlates within ``reach`` [px] of the whole image's shift, or the reverse match leads elsewhere.
     """
     found = np.full((len(pictures), *first.shape), np.nan)
     found[0] = first
@@ -222,7 +225,7 @@ def follow(pictures: Sequence[ImageArray], first: FloatArray, reach: int) -> Flo
 
 
 def _shift(before: ImageArray, after: ImageArray, points: FloatArray) -> IntArray:
-    """Shift (2,) [px] of the part of a picture that holds the ``points`` (m, 2)."""
+    """Shift (2,) [px] of the part of an image that holds the ``points`` (m, 2)."""
     left, top = np.maximum(np.floor(points.min(axis=0)).astype(int) - HALF, 0)
     right, bottom = np.ceil(points.max(axis=0)).astype(int) + HALF + 1
     score = cv2.matchTemplate(after, before[top:bottom, left:right], cv2.TM_CCOEFF_NORMED)
@@ -231,7 +234,7 @@ def _shift(before: ImageArray, after: ImageArray, points: FloatArray) -> IntArra
 
 
 def _displacement(before: ImageArray, after: ImageArray, point: FloatArray, way: IntArray, reach: int) -> FloatArray:
-    """Displacement (2,) [px] of the window around a ``point`` (2,), near ``way`` (2,); NaN where none is found."""
+    """Displacement (2,) [px] of the window around a ``point`` (2,), near ``way`` (2,); NaN if none is found."""
     u, v = (int(x) for x in np.rint(point))
     x, y = u + int(way[0]), v + int(way[1])
     height, width = before.shape
@@ -250,14 +253,14 @@ def _displacement(before: ImageArray, after: ImageArray, point: FloatArray, way:
 
 
 def _summit(peak: FloatArray) -> FloatArray:
-    """Summit (2,) [px] (u, v) of the paraboloid of least squares through 3 x 3 values, from their middle."""
+    """Maximum (2,) [px] (u, v) of the least-squares paraboloid through 3 x 3 values, from their centre."""
     a, b, c, d, e = PARABOLOID @ peak.ravel()
     offset = np.array([d * b - 2.0 * e * a, d * a - 2.0 * c * b]) / (4.0 * c * e - d * d)
     return np.clip(offset, -1.0, 1.0)
 
 
 def _paraboloid() -> FloatArray:
-    """(5, 9): coefficients of u, v, u², uv, v² of the paraboloid of least squares through 3 x 3 values."""
+    """Matrix (5, 9) of the coefficients of u, v, u², uv, v² of the least-squares paraboloid through 3 x 3 values."""
     v, u = np.mgrid[-1:2, -1:2].reshape(2, -1)
     return np.asarray(np.linalg.pinv(np.column_stack([np.ones(9), u, v, u * u, u * v, v * v]))[1:])
 
@@ -271,20 +274,20 @@ PERIOD_NS = 33_000_000
 
 
 def context_of(camera: str, folder: Path = Path()) -> DriverContext:
-    """What a detector that stands alone is told of its cell."""
+    """Cell data for a detector used alone."""
     return DriverContext(MonotonicClock(), "pictures", folder, folder, camera)
 
 
 def prior_at(camera: str, t_ns: int, ids: IntArray, pixels: FloatArray, variance: float) -> Prior:
-    """Markers ``ids`` (n,) expected at ``pixels`` (n, 2), with a ``variance`` [px²] an axis."""
+    """Prior of markers ``ids`` (n,) at ``pixels`` (n, 2), with a ``variance`` [px²] per axis."""
     covariances = np.tile(variance * np.eye(2), (len(pixels), 1, 1))
     return Prior(camera, t_ns, np.asarray(ids, dtype=np.int64), pixels, np.zeros_like(pixels), covariances)
 
 
 @dataclass(frozen=True, eq=False)
 class LandmarkTracks:
-    """Landmarks that both cameras found in all of s pictures: ``ids`` (m,), ``pixels`` (s, 2, m, 2), and ``sigmas``
-    (s, 2, m) [px] an axis as the detector states them. ``learnt``: how many there were in the first pictures.
+    """Landmarks that both cameras found in all of s images: ``ids`` (m,), ``pixels`` (s, 2, m, 2), and ``sigmas``
+    (s, 2, m) [px] per axis as stated by the detector. ``learnt``: number in the first images.
     """
 
     ids: IntArray
@@ -296,9 +299,9 @@ class LandmarkTracks:
 def landmark_tracks(
     pictures: Mapping[str, Sequence[ImageArray]], settings: LearningSettings | None = None
 ) -> LandmarkTracks:
-    """Landmarks of the first pictures of two cameras in all ``pictures``, of each camera as many.
+    """Landmarks of the first images of two cameras in all ``pictures``, which are equally many for each camera.
 
-    Raises DriverError where the first ones show too few.
+    Raises DriverError if the first ones show too few.
     """
     landmarks, _ = learn_landmarks({name: images[:1] for name, images in pictures.items()}, None, settings)
     stops, m = len(next(iter(pictures.values()))), len(landmarks.ids)
@@ -319,7 +322,7 @@ def landmark_tracks(
 
 
 def epipolar_geometry(tracks: LandmarkTracks) -> FloatArray:
-    """``F`` (3, 3) of the two cameras by all matches of all pictures. Raises GeometryError."""
+    """``F`` (3, 3) of the two cameras by all matches of all images. Raises GeometryError."""
     left, right = (tracks.pixels[:, c].reshape(-1, 2) for c in (0, 1))
     sigma = float(np.sqrt(np.mean(tracks.sigmas**2)))
     return fundamental_robust(left, right, sigma)[0]

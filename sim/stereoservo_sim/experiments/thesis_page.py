@@ -31,7 +31,7 @@ def reproduce_all(
     done: Callable[[Reproduction], None] = lambda _: None,
     names: Iterable[str] = REPRODUCED,
 ) -> list[Reproduction]:
-    """Run the experiments of these names, with ``seeds`` repetitions where given; raises as they do."""
+    """Run the experiments of these names, with ``seeds`` repetitions if given; raises the errors of their runs."""
     found = []
     for name in names:
         experiment = find_experiment(name)
@@ -68,7 +68,7 @@ img { max-width: 100%; height: auto; background: white; }
 
 
 def page(found: list[Reproduction], seed: int) -> str:
-    """HTML page (one file: pictures inside, nothing fetched) of all that was run."""
+    """HTML page of all results (one file: images embedded, no external resources)."""
     compared = [row for one in found for row in one.compared]
     counts = tally(compared)
     parts = [
@@ -101,7 +101,7 @@ def _contents_line(item: Any, found: list[Reproduction]) -> tuple[str, str, str]
 
 
 def _section(one: Reproduction) -> str:
-    """One experiment: verdicts, figures, its rows, what is assumed."""
+    """One experiment: verdicts, figures, its rows, its assumptions."""
     name = one.experiment.name
     rows = [
         (escape(r.item), escape(r.what), escape(r.thesis), escape(r.ours), _word(r.verdict), escape(r.why))
@@ -144,7 +144,7 @@ def _rows_table(rows: list[dict[str, Any]]) -> str:
 
 
 def _table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """HTML table of cells that are HTML already."""
+    """HTML table of cells that are already HTML."""
     lines = ["<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows]
     return f"<table><tr>{''.join(f'<th>{name}</th>' for name in head)}</tr>{''.join(lines)}</table>"
 

@@ -1,8 +1,9 @@
 """Experiment: servoing accuracy with unsynchronised cameras, or a wrong latency, against triggered cameras.
 
-The demo's cell in lockstep, cameras at 30 Hz that arrive 40 ms after their shutters, with the noise that rendered dots
-have. Four conditions, each with a calibration of its own: a trigger; 15 ms between the shutters; the same with a
-latency told 10 ms too short and too long. The same goals by law ``cartesian3``, the same noise, judged by the truth.
+The demo's cell in lockstep, with cameras at 30 Hz whose images arrive 40 ms after their shutters, with the noise of
+rendered dots. Four conditions, each with its own calibration: a trigger; 15 ms between the shutters; the same with a
+stated latency 10 ms too short and too long. The same goals by law ``cartesian3``, the same noise, evaluated against
+ground truth.
 """
 
 from __future__ import annotations
@@ -34,17 +35,17 @@ LATENCY_S = 0.04
 SKEW_S = 0.015
 WRONG_S = 0.010
 NOISE_PX = 0.005
-"""What noise of two grey levels leaves of a rendered dot's centre."""
+"""Error of a rendered dot's centre due to noise of two grey levels."""
 GOALS = tuple(ShownGoal(name, "cartesian3") for name in DEMO_GOALS)
 TAKE_STEPS = 2000
 MOVING = 1e-3
-"""[rad/s] A joint that is commanded to be faster moves."""
+"""Commanded speed above which a joint counts as moving [rad/s]."""
 MEASURES = ("final_error_px", "final_error_mm", "line_deviation_mm", "innovation_px")
 
 
 @dataclass(frozen=True)
 class TimingCondition:
-    """An experimental condition. ``skew_s`` of the right camera's shutter; ``told_s``: the latency assumed by its
+    """An experimental condition. ``skew_s`` of the right camera's shutter; ``told_s``: the latency assumed in its
     stamps.
     """
 
@@ -70,7 +71,7 @@ class TimedGoalResult:
 
 
 def run_unsynchronised(*, seeds: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """Every condition with ``seeds`` seeds from ``seed`` on; the JSON object of the command."""
+    """Run every condition with ``seeds`` seeds from ``seed`` on; returns the JSON object of the command."""
     found = crossed(fly, CONDITIONS, seeds, seed, progress)
     flown = {
         condition.name: [one for goals in of_seeds for one in goals]
@@ -184,7 +185,7 @@ def _row(condition: TimingCondition, flown: list[TimedGoalResult], trigger: list
 
 
 def draw_unsynchronised(answer: dict[str, Any]) -> Figures:
-    """Final errors and deviations from the line, a column a condition."""
+    """Final errors and deviations from the line, one column per condition."""
     figure = picture(9, 4)
     measures = (("final_error_px", "[px]"), ("line_deviation_mm", "[mm]"))
     for axis, (measure, unit) in zip(figure.subplots(1, 2), measures, strict=True):

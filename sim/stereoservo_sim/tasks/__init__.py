@@ -1,1 +1,1 @@
-"""Campaigns of alignment tasks: task files, arms, controller knowledge, closed-loop runs, many in parallel."""
+"""Campaigns of alignment tasks: task files, arms, controller models, closed-loop runs, many in parallel."""

@@ -1,8 +1,8 @@
 """Simulated arms of the alignment tasks: the plate's true pose, and its motion by joint velocities.
 
 ``free`` is a virtual arm of six Cartesian generators that act at once; ``rx90`` a serial arm of six revolute joints
-with limits; ``twist`` the same behind an interface of Cartesian velocities (`twist_arm`). The controller has the
-readings of their joints only.
+with limits; ``twist`` the same behind an interface of Cartesian velocities (`twist_arm`). The controller receives only
+the readings of their joints.
 """
 
 from __future__ import annotations
@@ -35,16 +35,16 @@ from stereoservo_sim.world.synthetic import RX90_ROWS, SyntheticCell, dh_link, p
 ArmName = Literal["free", "rx90", "twist"]
 
 MID_RANGE = translation(0.0, 0.0, 1.1) @ rotation("y", 15) @ rotation("x", -10)
-"""The plate's pose (4, 4) at which the arms learn."""
+"""The plate's pose (4, 4) at the centre of calibration."""
 PLATE_ON_FLANGE = translation(0.0, 0.0, 0.02) @ rotation("x", 180)
-"""(4, 4): the plate's printed face looks along the flange's z."""
+"""Pose (4, 4) of the plate on the flange: its printed face points along the flange's z."""
 RX90_HOME = np.radians([10.0, -60.0, 165.0, 20.0, 50.0, 15.0])
 RX90_LIMITS = np.radians(
     [(-160.0, 160.0), (-227.5, 47.5), (-52.5, 232.5), (-270.0, 270.0), (-105.0, 120.0), (-270.0, 270.0)]
 )
-"""(6, 2) [rad]"""
+"""Limits (6, 2) [rad]."""
 GEAR_STEPS = 4
-"""Of imperfect mechanics in a step of the loop."""
+"""Steps of imperfect mechanics per step of the loop."""
 
 
 class TaskArm(Protocol):
@@ -56,7 +56,7 @@ class TaskArm(Protocol):
     limits: FloatArray
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
-        """Move at ``velocity`` (n,) for ``dt_s``. Raises DriverError where the arm has stopped by itself."""
+        """Move at ``velocity`` (n,) for ``dt_s``. Raises DriverError if the arm has stopped by itself."""
         ...
 
 
@@ -64,7 +64,7 @@ class FreeArm:
     """TaskArm with translations along and rotations about the rig's axes through the plate's centre at the start
     (re-based there).
 
-    ``joints``: the velocities' integrals, from zero.
+    ``joints``: the integrals of the velocities, from zero.
     """
 
     composition = Composition.SIMULTANEOUS
@@ -85,7 +85,7 @@ class FreeArm:
 
 
 class SerialArm:
-    """The RX 90 from a configuration ``joints`` (6,) of its links; with ``mechanics`` its readings are others."""
+    """The RX 90 from a configuration ``joints`` (6,) of its links; with ``mechanics`` its readings differ."""
 
     composition = Composition.BASE_FIRST
     limits = RX90_LIMITS
@@ -119,13 +119,13 @@ def mechanics_of(name: MechanicsPreset | None) -> tuple[Mechanics, ...] | None:
 
 
 def _cameras() -> tuple[FloatArray, FloatArray]:
-    """Intrinsics and poses from the rig to each camera, as synthetic cells have them."""
+    """Intrinsics and poses from the rig to each camera, in the form of synthetic cells."""
     return np.array([intrinsics()] * 2), np.linalg.inv(camera_poses())
 
 
 def free_cell() -> SyntheticCell:
-    """Synthetic cell of the free arm: a chain 3P3R at mid-range, for its trial motions."""
-    # From joint frame to joint frame, z along x, y, z, x, y, z of the rig.
+    """Synthetic cell of the free arm: a chain 3P3R at mid-range, for its calibration motion."""
+    # Transforms between joint frames, whose z axes are x, y, z, x, y, z of the rig.
     turns = [rotation("y", 90), rotation("x", -90), np.eye(4)] * 2
     facing = MID_RANGE.copy()
     facing[:3, 3] = 0.0
@@ -171,7 +171,7 @@ class Reach:
 
 
 def rx90_reach(cell: SyntheticCell, start: FloatArray, goal: FloatArray) -> Reach | None:
-    """Configurations of the RX 90 for two poses (4, 4) of the plate within its limits; None where there are none."""
+    """Configurations of the RX 90 for two poses (4, 4) of the plate within its limits; None if there are none."""
     back = np.linalg.inv(PLATE_ON_FLANGE)
     found = [inverse_kinematics(np.linalg.inv(cell.base) @ pose @ back, RX90_LIMITS) for pose in (start, goal)]
     if not (len(found[0]) and len(found[1])):
@@ -191,10 +191,11 @@ SHOULDER = RX90_ROWS[0][2]
 
 
 def inverse_kinematics(flange: FloatArray, limits: FloatArray) -> FloatArray:
-    """All configurations (k, 6) [rad] within ``limits`` (6, 2) that bring the flange to (4, 4) in the base's frame.
+    """All configurations (k, 6) [rad] within ``limits`` (6, 2) that bring the flange to a pose (4, 4) in the base's
+    frame.
 
-    k is 0 out of reach. Angles a whole turn apart are configurations of their own. At a singular wrist the fourth joint
-    is left at zero; above the shoulder the first is.
+    k is 0 out of reach. Angles a whole turn apart are separate configurations. At a singular wrist the fourth joint is
+    left at zero; above the shoulder the first is.
     """
     wrist = flange[:3, 3] - HAND * flange[:3, 2]
     found = []
@@ -229,7 +230,7 @@ def _wrist(R: FloatArray, flip: bool) -> tuple[float, float, float]:
 
 
 def _within(angles: FloatArray, limits: FloatArray) -> FloatArray:
-    """All solutions by whole turns that lie within the limits."""
+    """All solutions, including whole turns, that lie within the limits."""
     kept = []
     for row in angles:
         choices = []

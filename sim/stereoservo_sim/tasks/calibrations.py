@@ -1,9 +1,9 @@
-"""Controller knowledge in the tasks: learnt from trial motions (``self``), from ground truth (``exact``), or metric
+"""The controller's model in the tasks: from the calibration motion (``self``), from ground truth (``exact``), or metric
 with errors (``coarse``).
 
 ``self``: joint by joint from mid-range, `STOPS` stops a joint as far as both cameras keep the plate in view,
-`FRAMES` noisy frames averaged at each, as the daemon does. From then on the arm's own readings say where it is: the
-free arm's operators are re-based to a task's start by the displacement that its readings tell.
+`FRAMES` noisy frames averaged at each, as the daemon does. Afterwards the arm's position is taken from its own
+readings: the free arm's operators are re-based to a task's start by the displacement computed from its readings.
 """
 
 from __future__ import annotations
@@ -49,17 +49,17 @@ CELLS: dict[ArmName, Callable[[], SyntheticCell]] = {
     "twist": twist_cell,
 }
 
-"""Of a joint's trial motion, and averaged at a stop."""
+"""Synthetic cell of each arm."""
 LEAST_SIGMA_PX = 1e-3
-"""Noise of the trials' averages where the images have none: a fit weighs by it."""
+"""Standard deviation assigned to averaged observations if the images have no noise: a fit needs it as weight."""
 TRIAL_MARGIN_PX, TRIAL_ANGLE_DEG = 20.0, 65.0
-"""Trial motions end this far from an image's border, and where the plate is seen at this angle from its normal."""
+"""Calibration motions end this far from an image's border, or when the plate is seen at this angle to its normal."""
 MAX_TURN, MAX_TRAVEL = np.radians(50.0), 0.25
-"""[rad], [m] to either side."""
+"""Largest calibration motion to either side [rad], [m]."""
 
 
 class TaskCalibration(NamedTuple):
-    """An arm with its model; None where the model is metric with errors, drawn per task. ``facts``: for the report.
+    """An arm with its model; None if the model is metric with errors, drawn per task. ``facts``: for the report.
 
     ``focal_error`` (share), ``hand_eye_error_deg``: of a metric model.
     """
@@ -76,10 +76,11 @@ class TaskCalibration(NamedTuple):
 class Knowledge:
     """The controller's model at the start of a task.
 
-    ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4) and ``points`` (m, 4) of height ``plane_at_infinity @ M = 1``; the
-    points by kinematics alone, None where the markers' places on the body are unknown. ``basis`` (r, 4, 4): operators
-    that span the displacements; of a serial arm those at its ``zero`` (n,), None where they stay. ``kinds``: of the
-    joints.
+    ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4) and ``points`` (m, 4) scaled to ``plane_at_infinity @ M = 1``; the
+    points by kinematics alone, None if the markers' positions on the body are unknown. ``basis`` (r, 4, 4): operators
+    that span the displacements; of a serial arm those at its ``zero`` (n,), which is None if they are constant.
+    ``kinds``:
+    of the joints.
     """
 
     composition: Composition
@@ -92,7 +93,7 @@ class Knowledge:
     zero: FloatArray | None = None
 
     def operators(self, joints: FloatArray) -> FloatArray:
-        """(n, 4, 4) at the arm's readings (n,) (5.21)."""
+        """Operators (n, 4, 4) at the arm's readings (n,) (5.21)."""
         if self.zero is None:
             return self.basis
         kinds = np.array([kind == "prismatic" for kind in self.kinds], dtype=np.uint8)
@@ -107,7 +108,7 @@ def calibrate(
     seed: int,
     mechanics: MechanicsPreset | None = None,
 ) -> TaskCalibration:
-    """Calibrate once per file and seed. Raises CalibrationError where the trial motions give no model."""
+    """Calibrate once per file and seed. Raises CalibrationError if the calibration motion gives no model."""
     cell = CELLS[arm]()
     if calibration == "coarse":
         return metric_model(arm, cell, FOCAL_ERROR, HAND_EYE_ERROR_DEG)
@@ -117,7 +118,7 @@ def calibrate(
 
 
 def metric_model(arm: ArmName, cell: SyntheticCell, focal_error: float, hand_eye_error_deg: float) -> TaskCalibration:
-    """Metric model with focal lengths too long by a share, and the arm rotated about each task's own axis."""
+    """Metric model with too long focal lengths (by a share), and the arm rotated about each task's own axis."""
     facts: dict[str, object] = {"focal_error": focal_error, "hand_eye_error_deg": hand_eye_error_deg}
     return TaskCalibration(arm, cell, None, facts, focal_error, hand_eye_error_deg)
 
@@ -129,7 +130,9 @@ def self_calibrated(
     seed: int,
     mechanics: MechanicsPreset | None = None,
 ) -> TaskCalibration:
-    """Model from trial motions about the cell's home, of a serial arm with ``mechanics``. Raises CalibrationError."""
+    """Model from a calibration motion about the cell's home, of a serial arm with ``mechanics``. Raises
+    CalibrationError.
+    """
     started = time.perf_counter()
     cell = with_trial_ranges(cell)
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(1,)))
@@ -166,7 +169,7 @@ def with_trial_ranges(cell: SyntheticCell) -> SyntheticCell:
 
 
 def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bool_]:
-    """(s,): whether each camera sees the plate's front at less than ``TRIAL_ANGLE_DEG`` from its normal."""
+    """Mask (s,): whether each camera sees the plate's front at less than ``TRIAL_ANGLE_DEG`` from its normal."""
     markers = cell.markers(positions)[..., :3]
     middle = markers.mean(axis=1)
     normal = -np.cross(markers[:, 1] - markers[:, 0], markers[:, 3] - markers[:, 0])
@@ -177,7 +180,7 @@ def _shows_face(cell: SyntheticCell, positions: FloatArray) -> npt.NDArray[np.bo
 
 
 def known_at_start(calibration: TaskCalibration, task: AlignmentTask, joints: FloatArray | None) -> Knowledge:
-    """The controller's knowledge at the start of ``task``; ``joints`` (n,): readings of a serial arm there."""
+    """The controller's model at the start of ``task``; ``joints`` (n,): readings of a serial arm there."""
     if calibration.model is None:
         return _coarse(calibration, task, serial=joints is not None)
     model = calibration.model
@@ -201,16 +204,14 @@ def known_at_start(calibration: TaskCalibration, task: AlignmentTask, joints: Fl
 def readings(start: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Readings of the free arm's joints at a pose (4, 4): shift (3,) [m] and rotation (3,) [rad] from mid-range.
 
-    First the turn about the middle where the plate was, then the shift.
+    The rotation about the initial position of the centre comes first, then the shift.
     """
     turn = Rotation.from_matrix(start[:3, :3] @ MID_RANGE[:3, :3].T).as_rotvec()
     return start[:3, 3] - MID_RANGE[:3, 3], turn
 
 
 def _coarse(calibration: TaskCalibration, task: AlignmentTask, serial: bool) -> Knowledge:
-    """Metric model in the rig's frame: focal lengths too long, the arm rotated about the plate's centre at the
-    start.
-    """
+    """Metric model in the rig's frame: focal lengths too long, arm rotated about the plate's centre at the start."""
     matrices = camera_matrices(1.0 + calibration.focal_error)
     infinity = np.array([0.0, 0.0, 0.0, 1.0])
     centres = _camera_centres(matrices, infinity)

@@ -1,6 +1,4 @@
-"""Parallel execution of many tasks, each with its own seed, so that results do not depend on the number of
-processes.
-"""
+"""Parallel execution of many tasks, each with its own seed: results do not depend on the number of processes."""
 
 from __future__ import annotations
 
@@ -21,7 +19,7 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 
 Tell = Callable[[int, int], None]
 CHUNK = 4
-"""Tasks that a process takes at once."""
+"""Tasks per unit of work of a process."""
 
 _worker: tuple[TaskCalibration, LoopSettings] | None = None
 
@@ -29,9 +27,9 @@ _worker: tuple[TaskCalibration, LoopSettings] | None = None
 def run_campaign(
     tasks: Sequence[AlignmentTask], settings: LoopSettings, jobs: int, tell: Tell = lambda done, total: None
 ) -> dict[str, Any]:
-    """Run every task; ``tell(done, total)`` as they end. Raises CalibrationError.
+    """Run every task; ``tell(done, total)`` is called as they end. Raises CalibrationError.
 
-    The answer has the tasks in their order and what `summary` makes of them.
+    Returns the results in the order of the tasks, and their `summary`.
     """
     started = time.perf_counter()
     calibration = calibrate(settings.arm, settings.calibration, settings.noise_px, settings.seed, settings.mechanics)
@@ -59,7 +57,7 @@ def _batches(
             yield [run_task(task, calibration, settings)[0]]
         return
     chunks = [tasks[i : i + CHUNK] for i in range(0, len(tasks), CHUNK)]
-    # A fresh interpreter each: a fork would copy the threads of the progress bar half.
+    # A new interpreter each: a fork would copy the threads of the progress bar in an undefined state.
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(
         min(jobs, len(chunks)), context, initializer=_start, initargs=(calibration, settings)
@@ -85,12 +83,12 @@ def _run_chunk(chunk: Sequence[AlignmentTask]) -> list[TaskResult]:
 
 
 def default_jobs() -> int:
-    """Number of processors that this process may use."""
+    """Number of processors available to this process."""
     return len(os.sched_getaffinity(0))
 
 
 def summary(results: Sequence[TaskResult]) -> dict[str, Any]:
-    """Rates and extremes of a campaign: over the reachable tasks; errors and deviations over the solved ones."""
+    """Rates and extremes of a campaign over the reachable tasks; errors and deviations over the solved ones."""
     judged = [result for result in results if result.success is not None]
     solved = [result for result in judged if result.success]
     low, high = wilson(len(solved), len(judged)) if judged else (0.0, 1.0)

@@ -63,25 +63,26 @@ from stereoservo_sim.world.synthetic import Kind
 
 TIME_LIMIT_S = MAX_ITERATIONS / DEFAULT_RATE_HZ
 REST_STEPS = 50
-"""Steps at 25 Hz over which an error at rest is averaged, after it has held as long; other rates: the same time."""
+"""Steps at 25 Hz over which an error at rest is averaged, after it has held as long; at other rates the same time."""
 LOST_S = 1.0
-"""For which the arm stands still for want of markers before the run has failed."""
+"""Time for which the arm may stand still without enough visible markers before the run has failed."""
 STILL_FALLING = 0.75
-"""A mean error below this share of the one before it still falls: the task has not come to rest."""
+"""A mean error below this share of the previous one is still decreasing: the task has not come to rest."""
 NEGLIGIBLE_PX = 1e-4
-"""Below it an error counts as settled, falling or not."""
+"""A smaller error counts as settled, decreasing or not."""
 
 
 @dataclass(frozen=True)
 class LoopSettings:
     """Settings of the tasks' execution.
 
-    ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws that could correct
-    their step do not. ``joint_speed`` [rad/s or m/s]: of the fastest joint at most, the others in proportion.
-    ``drop_camera``: start and duration [s] of the time for which the second camera is dropped. ``centre``: ``middle``
-    of the markers or the number of one. ``mechanics``: of the arm ``rx90``; None: it is perfect. ``core``: the servo
-    core drives the arm, which needs joints and a model; else the law alone. ``coasts``: the law goes on with the
-    predicted pixels of markers that are not seen.
+    ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws with a step
+    correction
+    do not use it. ``joint_speed`` [rad/s or m/s]: limit of the fastest joint, the others in proportion.
+    ``drop_camera``: start and duration [s] of an interval without the second camera. ``centre``: ``middle``
+    of the markers or the number of one. ``mechanics``: of the arm ``rx90``; None: perfect. ``core``: the servo
+    core drives the arm, which needs joints and a model; else the law alone. ``coasts``: the law continues with the
+    predicted pixels of invisible markers.
     """
 
     law: str = DEFAULT_LAW
@@ -103,27 +104,32 @@ class LoopSettings:
 
 
 class PlateSight(Protocol):
-    """Protocol of what shows the controller the plate; by itself its projections with noise (`Projections`)."""
+    """Protocol of a source of the plate's pixels for the controller; default: its projections with noise
+    (`Projections`).
+    """
 
     def look(
         self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Pixels (c, m, 2), and 1 or 0 (c, m) for what is seen of them, with the plate at ``pose`` (4, 4); its
-        controller expects it at ``expected`` (c, m, 2), None at first. None where too little is seen to go on.
+        """Pixels (c, m, 2) and visibility (c, m), 1 or 0, with the plate at ``pose`` (4, 4).
+
+        ``expected`` (c, m, 2): pixels expected by the controller, None at first. Returns None if too little is visible
+        to
+        continue.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Projections:
-    """Sight of exact projections with the settings' noise, inside an image of a camera that is not dropped."""
+    """Exact projections with the settings' noise, inside an image of a camera that is not dropped."""
 
     settings: LoopSettings
 
     def look(
         self, pose: FloatArray, time_s: float, expected: FloatArray | None, rng: np.random.Generator
     ) -> tuple[FloatArray, FloatArray]:
-        """As `PlateSight` has it."""
+        """See `PlateSight`."""
         pixels = sight(pose).pixels
         seen = in_images(pixels).astype(np.float64)
         if self.settings.drop_camera is not None:
@@ -136,12 +142,12 @@ class Projections:
 class TaskResult(msgspec.Struct, frozen=True):
     """Result of a task, evaluated on noise-free projections.
 
-    ``success``: None where the arm cannot reach it. ``iterations``: until the error stayed below `SUCCESS_PX`, or all
+    ``success``: None if the arm cannot reach it. ``iterations``: until the error stayed below `SUCCESS_PX`, or all
     that were made. ``final_error_px``: mean over the last `REST_STEPS` of the largest error over markers and cameras
-    used; ``floor_px``: what image noise leaves of it to this loop. ``line_deviation_mm``: the largest distance of
-    the plate's middle from the straight path. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity then.
+    used; ``floor_px``: the expected part of it due to image noise. ``line_deviation_mm``: the largest distance of
+    the plate's centre from the straight path. ``rest_mm_s``, ``rest_mrad_s``: rms of the plate's velocity at rest.
     ``closest_view_px``: least distance of a marker from an image's border, on the whole path. ``reason``: why it
-    failed; ``refused``, ``stopped``: in the words of who refused it, or of the arm's controller that stopped.
+    failed; ``refused``, ``stopped``: message of the refusal, or of the arm's controller when it stopped.
     """
 
     id: int
@@ -165,8 +171,9 @@ class TaskResult(msgspec.Struct, frozen=True):
 class Trace:
     """Recorded path of a task: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines.
 
-    ``joints`` (k, n): the arm's readings. ``task_errors`` (k - 1, e): what the law saw of its components at each step,
-    NaN where it was not asked.
+    ``joints`` (k, n): the arm's readings. ``task_errors`` (k - 1, e): the law's error components at each step, NaN if
+    it
+    was not called.
     """
 
     poses: FloatArray
@@ -179,7 +186,7 @@ class Trace:
 def run_task(
     task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings, shown: PlateSight | None = None
 ) -> tuple[TaskResult, Trace]:
-    """Run one task, as ``shown``; deterministic given task, calibration and settings."""
+    """Run one task with observations ``shown``; deterministic given task, calibration and settings."""
     arm = _placed_arm(task, calibration, settings)
     if arm is None:
         return _unreachable(task, settings)
@@ -198,7 +205,7 @@ def run_task(
 
 
 def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: LoopSettings) -> TaskArm | None:
-    """The arm with the plate at the task's start; None where it cannot do the task."""
+    """The arm with the plate at the task's start; None if it cannot execute the task."""
     if settings.arm == "free":
         return FreeArm(task.start)
     if settings.arm == "twist":
@@ -209,8 +216,8 @@ def _placed_arm(task: AlignmentTask, calibration: TaskCalibration, settings: Loo
 
 
 def _way(task: AlignmentTask, settings: LoopSettings) -> FloatArray:
-    """The way (k, 4, 4) on which the law leads the plate of an arm that can do everything, from exact images; where it
-    does not get there, the straight one.
+    """Path (k, 4, 4) of the plate under the law, with an unlimited arm and exact images; the straight path if the law
+    does not reach the goal.
     """
     free = LoopSettings(law=settings.law, jacobian=settings.jacobian, noise_px=0.0, calibration="exact")
     result, trace = run_task(task, _known_free_arm(), free)
@@ -223,7 +230,7 @@ def _known_free_arm() -> TaskCalibration:
 
 
 class Controller:
-    """The controller: pixels and readings in, joint velocity out. It has its `Knowledge` and the goal's pixels
+    """The controller: computes joint velocities from pixels and readings, with its `Knowledge` and the goal's pixels
     only.
     """
 
@@ -254,7 +261,7 @@ class Controller:
     def step(self, pixels: FloatArray, seen: FloatArray, joints: FloatArray) -> FloatArray:
         """Velocity (n,) from a frame (c, m, 2) with ``seen`` (c, m) 1 or 0, and the arm's readings (n,).
 
-        Raises NoPathError where a path must be planned and there is none.
+        Raises NoPathError if a path must be planned and there is none.
         """
         knowledge = self._knowledge
         self._operators = knowledge.operators(joints)
@@ -288,12 +295,14 @@ class Controller:
 
     @property
     def expected(self) -> FloatArray | None:
-        """Pixels (c, m, 2) at which the markers are expected; None where no point is known yet."""
+        """Expected pixels (c, m, 2) of the markers; None while no point is known."""
         points = self.estimate.points
         return project_points(self._knowledge.matrices, points)[0] if len(points) else None
 
     def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
-        """Move the arm for a step from a frame; why it cannot be, or ''. Raises NoPathError, DriverError."""
+        """Move the arm for one step from a frame; returns why this is impossible, or ''. Raises NoPathError,
+        DriverError.
+        """
         velocity = self.step(pixels, seen, arm.joints)
         if not np.isfinite(velocity).all():
             return "NO_COMMAND"
@@ -309,7 +318,7 @@ class Controller:
         every = np.ones(self._set_points.shape[:2])
         found, ok = triangulate(knowledge.matrices, self._set_points, every, 5)
         targets = found / (found @ knowledge.plane_at_infinity)[:, None]
-        # What triangulation errs by in the same way, here and there, then cancels.
+        # Equal systematic errors of the triangulation at both poses then cancel.
         if knowledge.points is not None and not self.estimate.triangulates:
             pose = goal_pose(_arrays(knowledge), knowledge.basis, points, targets, ok, FACE, self._set_points, every)
             targets = pose.points
@@ -331,7 +340,7 @@ def _law(name: str, knowledge: Knowledge) -> Callable[[Scene, Task, Options], La
     if name in CLASSICAL:
         return CLASSICAL[name]
     if name == "euclidean-points" and not knowledge.plane_at_infinity[:3].any():
-        # The frame of a metric model is the rig's own.
+        # A metric model is in the rig's frame.
         return euclidean_points(np.eye(4))
     known = ", ".join([*LAWS, *CLASSICAL, "euclidean-points (metric models)"])
     raise ValueError(f"no law {name!r} for this model; known: {known}")
@@ -343,7 +352,7 @@ def cameras_used(law: str) -> int:
 
 
 def _arrays(knowledge: Knowledge) -> ModelArrays:
-    """The model in the form of the daemon's search for the goal's pose."""
+    """The model in the form used by the daemon's search for the goal pose."""
     n, m = len(knowledge.basis), len(FACE) + 1
     return ModelArrays(
         generators=knowledge.basis,
@@ -500,11 +509,11 @@ def _unreachable(task: AlignmentTask, settings: LoopSettings) -> tuple[TaskResul
 
 
 # -- laws that are compared ----------------------------------------------------------------------------------
-# Control laws for comparison only: camera by camera (8.37), and on metric points of a calibrated rig (8.17).
+# Control laws for comparison only: per camera (8.37), and on metric points of a calibrated rig (8.17).
 
 
 def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
-    """The mean of the laws of the single cameras that see (8.37, halved for two: errata)."""
+    """Mean of the laws of the single cameras that see the markers (8.37, halved for two: errata)."""
     velocity, conditioning, seeing = np.zeros(scene.operators.shape[0]), 1.0, 0
     for camera in range(scene.matrices.shape[0]):
         alone = np.zeros_like(task.wanted)
@@ -525,7 +534,7 @@ def stereo_block(scene: Scene, task: Task, options: Options) -> LawStep:
 def euclidean_points(
     H_projective_to_euclidean: FloatArray,
 ) -> Callable[[Scene, Task, Options], LawStep]:
-    """The law on points in metric coordinates (8.17), for a calibrated rig: what others do, for comparison.
+    """The law on points in metric coordinates (8.17), for a calibrated rig: the conventional method, for comparison.
 
     ``H_projective_to_euclidean`` (4, 4) maps the frame's points to the metric frame of that rig.
     """
@@ -557,14 +566,14 @@ def _seen(scene: Scene, task: Task) -> FloatArray:
 CLASSICAL: Mapping[str, Callable[[Scene, Task, Options], LawStep]] = {
     "stereo-block": stereo_block,
 }
-"""By name. `euclidean_points` needs a metric frame besides."""
+"""Laws by name. `euclidean_points` also needs a metric frame."""
 
 
 # -- the core as a controller --------------------------------------------------------------------------------
 # Tasks driven by the servo core: goal, planning, law, monitors and safety stage as they run in the daemon.
 #
-# The core runs at `CORE_RATE_HZ`, the frames come at the rate of the tasks' loop; each is in hand a cycle after its
-# shutter. What the cell's operator does (a model, enable) is done before the first frame.
+# The core runs at `CORE_RATE_HZ`, frames arrive at the rate of the tasks' loop, each one cycle after its
+# shutter. The cell operator's actions (set a model, enable) are done before the first frame.
 
 
 CORE_RATE_HZ = 250.0
@@ -572,7 +581,7 @@ TOLERANCE_PX = 0.6 * SUCCESS_PX
 HOLD_FRAMES = 5
 SPEED = {"revolute": 1.0, "prismatic": 0.25}
 ACCELERATION = {"revolute": 4.0, "prismatic": 1.0}
-"""Of every joint at most, by its kind: [rad/s or m/s], [rad/s² or m/s²]."""
+"""Limits of every joint by its kind: [rad/s or m/s], [rad/s² or m/s²]."""
 LEAST_SIGMA_PX = 0.01
 LOST = ("goal_aborted", "goal_cancelled", "fault")
 
@@ -605,8 +614,9 @@ class CoreController:
         self._looks = round(LOOK_S * rate_hz)
 
     def advance(self, pixels: FloatArray, seen: FloatArray, arm: TaskArm) -> str:
-        """Move the arm until the next frame after this one, (c, m, 2) with ``seen`` (c, m) 1 or 0; why the goal was
-        lost, or ''. Raises NoPathError where it is refused, DriverError where the arm has stopped by itself.
+        """Move the arm until the next frame after this one, (c, m, 2) with ``seen`` (c, m) 1 or 0; returns why the goal
+        was
+        lost, or ''. Raises NoPathError if it is refused, DriverError if the arm has stopped by itself.
         """
         frame = self._observations(pixels, seen)
         self._looks -= 1
@@ -649,7 +659,7 @@ class CoreController:
         return outputs
 
     def _observations(self, pixels: FloatArray, seen: FloatArray) -> tuple[CameraObservation, ...]:
-        """Frames whose shutters open now, in hand in the next cycle."""
+        """Frames with shutters at this time, available in the next cycle."""
         received = self._now_ns + self._period_ns
         return tuple(
             CameraObservation(
@@ -703,15 +713,15 @@ def _settings(
 
 
 LOOK_S = 0.4
-"""The controller looks at the plate for so long before it plans."""
+"""Time for which the controller observes the plate before it plans."""
 VIEW_MARGIN_PX = 2.0
-"""Planned distance from the images' borders: for noise and what the body lags."""
+"""Planned distance from the images' borders, for noise and following error."""
 JOINT_MARGIN = 0.02
 """Planned distance from the joints' limits [rad], likewise."""
 LARGEST_LAG_PX = 20.0
-"""Distance behind its path at which the plan waits for the body."""
+"""Following error at which the plan waits for the body."""
 SPEED_M, SPEED_RAD = 0.1, 0.6
-"""[m/s], [rad/s]; accelerations reach them in half a second."""
+"""Speeds [m/s], [rad/s]; reached by acceleration in half a second."""
 ACCELERATION_S = 0.5
 
 
@@ -735,8 +745,9 @@ class PlannedPath:
     def task_now(self, scene: Scene, task: Task, joints: FloatArray, dt_s: float) -> Task:
         """Current set-points of the plan, with their velocities as a difference over ``dt_s``.
 
-        The same of its joints, for an arm at ``joints`` (n,).
-        The plan's time advances by ``dt_s``, or less where the body lags.
+        Likewise its joint positions, for an arm at ``joints`` (n,). The plan's time advances by ``dt_s``, or less if
+        the body
+        lags.
         """
         set_points = self._set_points(scene)
         apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
@@ -756,7 +767,7 @@ class PlannedPath:
         pixels, _ = project_points(scene.matrices, points)
         length_s = float(self.plan.times[-1])
         share = min(1.0, self._time_s / length_s) if length_s > 0.0 else 1.0
-        # What the goal's pixels differ by from the body's projections comes in along the way.
+        # The difference of the goal's pixels from the body's projections is added gradually along the path.
         goal, _ = project_points(scene.matrices, self._task.target_points)
         return np.asarray(pixels + share * (self._task.set_points - goal))
 

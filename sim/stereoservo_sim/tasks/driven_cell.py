@@ -1,5 +1,5 @@
-"""A synthetic cell in virtual time, driven by the servo core: mechanics between drive and link, encoders whose zeros
-may be off, pictures that are late by an unstated time. Judged by the truth, which the core never sees.
+"""A synthetic cell in virtual time, driven by the servo core: mechanics between drive and link, encoders with zero
+errors, images with an unreported delay. Evaluated against ground truth, which the core never sees.
 """
 
 from __future__ import annotations
@@ -40,21 +40,21 @@ TOLERANCE_PX = 0.25
 HOLD_FRAMES = 5
 TIME_LIMIT_S = 60.0
 SPEED, ACCELERATION = 1.0, 4.0
-"""[rad/s], [rad/s²] of every joint at most."""
+"""Limits of every joint [rad/s], [rad/s²]."""
 TRANSFER_S = 0.02
-"""From a picture's stamp until the core has it."""
+"""Time from an image's stamp until the core receives it."""
 LEAST_SIGMA_PX = 0.01
 FIRST_FRAMES_S = 0.5
-"""Time in which the core sees the arm at rest before it is given a goal."""
+"""Time for which the core observes the arm at rest before it is given a goal."""
 STOPS, FRAMES = 7, 4
-"""Of a joint's trial motion, and averaged at a stop."""
+"""Stops per joint of the calibration motion, and frames averaged at a stop."""
 LONGEST_TRIALS_S = 600.0
 ENDS = ("goal_reached", "goal_aborted", "goal_cancelled")
 
 
 @dataclass(frozen=True)
 class Creep:
-    """A camera that creeps at a constant rate from the first step on: the ``twist`` (6,) [m/s, rad/s] of its
+    """A camera that moves at a constant rate from the first step on: the ``twist`` (6,) [m/s, rad/s] of its
     translation and its rotation vector, in the camera's own frame.
     """
 
@@ -62,7 +62,7 @@ class Creep:
     twist: FloatArray
 
     def moved(self, cell: SyntheticCell, seconds: float) -> SyntheticCell:
-        """The cell with the camera where it is after so many seconds."""
+        """The cell with the camera at its pose after this time."""
         turn, angle = np.eye(4), float(np.linalg.norm(self.twist[3:])) * seconds
         if angle > 0.0:
             x, y, z = self.twist[3:] / np.linalg.norm(self.twist[3:])
@@ -76,10 +76,11 @@ class Creep:
 
 @dataclass(frozen=True)
 class Imperfections:
-    """What is not as the core believes. ``mechanics`` of each joint, None: none. ``zero_offset`` (n,) [rad or m]: by
-    which encoders tell more than when the model was learnt; None: nothing. ``late_s``: by which pictures are older than
-    their stamps tell, with ``jitter_s`` uniform in addition. ``noise_px`` of each coordinate. ``creep``: a camera that
-    does not stay where it was when the model was learnt.
+    """Deviations of the cell from the core's assumptions.
+
+    ``mechanics`` of each joint, None: perfect. ``zero_offset`` (n,) [rad or m]: change of the encoder readings since
+    calibration; None: none. ``late_s``: unreported age of images at their stamp, with ``jitter_s`` uniform in addition.
+    ``noise_px``: of each coordinate. ``creep``: a camera that has moved since calibration.
     """
 
     mechanics: Sequence[Mechanics] | None = None
@@ -92,8 +93,8 @@ class Imperfections:
 
 @dataclass(frozen=True)
 class GoalEnd:
-    """How a goal ended: the ``kind`` of its last event ("" where it had none in time), the reasons' ``codes``, the
-    core's ``verdict`` on its images, the ``seconds`` that it took.
+    """How a goal ended: the ``kind`` of its last event ("" if none came in time), the reasons' ``codes``, the
+    core's ``verdict`` on its images, and its duration in ``seconds``.
     """
 
     kind: str
@@ -103,8 +104,8 @@ class GoalEnd:
 
 
 class DrivenCell:
-    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: where the joints stand,
-    ``path``: where they stood after each cycle, ``verdicts``: what the watch over the model has told.
+    """A cell with its arm at ``q`` (n,), enabled, with ``model`` in use, if any; ``links``: true joint positions,
+    ``path``: these after each cycle, ``verdicts``: reports of the model monitor.
     """
 
     def __init__(
@@ -135,7 +136,7 @@ class DrivenCell:
 
     @property
     def mechanics(self) -> Sequence[Mechanics]:
-        """Of the joints, perfect ones where none were given."""
+        """Mechanics of the joints, perfect if none were given."""
         return self._wrong.mechanics or [Mechanics()] * len(self.links)
 
     @property
@@ -145,17 +146,17 @@ class DrivenCell:
 
     @property
     def readings(self) -> FloatArray:
-        """What the encoders tell (n,)."""
+        """Encoder readings (n,)."""
         if self._gears is None:
             return self.links + self._offset
         return quantised(self._gears.readings + self._offset, self._gears.encoder_step)
 
     def pixels(self) -> FloatArray:
-        """Exact pixels (c, m, 2) of the markers now, before cameras that stand where they stood at first."""
+        """Current exact pixels (c, m, 2) of the markers, with the cameras at their initial poses."""
         return self.cell.pixels(self.links[None])[:, 0]
 
     def step(self, *commands: Command, model_update: ModelUpdate | None = None) -> StepOutputs:
-        """One cycle of the core and what the arm makes of its command."""
+        """Run one cycle of the core and move the arm by its command."""
         self._now_ns += self._period_ns
         self._seq += 1
         self._past = [*self._past[-64:], (self._now_ns, self.links.copy())]
@@ -193,7 +194,7 @@ class DrivenCell:
         gain: float | None = None,
         damping: float | None = None,
     ) -> GoalEnd:
-        """Drive to set-points (c, m, 2) [px], of which the markers in view count, until an event ends the goal."""
+        """Drive to set-points (c, m, 2) [px], of which only markers in view are used, until an event ends the goal."""
         ids = self.cell.marker_ids
         inside = (wanted > -0.5).all(axis=-1) & (wanted < (self.cell.width - 0.5, self.cell.height - 0.5)).all(axis=-1)
         target = FeatureTarget(
@@ -204,7 +205,7 @@ class DrivenCell:
         )
         name = str(uuid.UUID(int=self._seq + 1))
         outputs = self.step(RunGoal(Goal(name, target, law=law, gain=gain, damping=damping, time_limit_s=time_limit_s)))
-        limit = round(2.0 * time_limit_s * RATE_HZ)  # what waits for its cameras is not timed by the core
+        limit = round(2.0 * time_limit_s * RATE_HZ)  # the core has no time limit while it waits for cameras
         for cycle in range(limit):
             for event in outputs.events:
                 if event.kind == "reply" and not event.accepted:
@@ -216,7 +217,7 @@ class DrivenCell:
         return GoalEnd("", held, self._verdict(outputs), limit / RATE_HZ)
 
     def trials(self) -> TrialData:
-        """What the core's trial motions show. Raises CalibrationError."""
+        """Observations of the core's calibration motion. Raises CalibrationError."""
         collector = TrialCollector(self.settings)
         outputs = self.step(Calibrate(str(uuid.UUID(int=self._seq + 1))))
         for _ in range(round(LONGEST_TRIALS_S * RATE_HZ)):
@@ -230,7 +231,7 @@ class DrivenCell:
         raise CalibrationError("aborted", f"trial motions take more than {LONGEST_TRIALS_S:g} s")
 
     def rest(self, seconds: float) -> tuple[FloatArray, int]:
-        """Pixels (c, m, 2) averaged over a time without a goal, and how often a joint's command changed its sign."""
+        """Pixels (c, m, 2) averaged over a time without a goal, and number of sign changes of a joint's command."""
         total, reversals = np.zeros_like(self.pixels()), 0
         last = np.zeros_like(self.links)
         cycles = round(seconds * RATE_HZ)
@@ -260,7 +261,7 @@ class DrivenCell:
         self.links = self._gears.link.copy()
 
     def _expose(self) -> None:
-        """Pictures stamped now, of the arm where it was ``late_s`` ago."""
+        """Images stamped now, of the arm as it was ``late_s`` ago."""
         wrong = self._wrong
         late_ns = round(1e9 * (wrong.late_s + wrong.jitter_s * self._rng.uniform()))
         now = self.cell if wrong.creep is None else wrong.creep.moved(self.cell, self.seconds)

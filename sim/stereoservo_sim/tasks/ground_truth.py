@@ -27,8 +27,9 @@ EYES = camera_poses()[:, :3, 3].copy()
 class PlateView(NamedTuple):
     """True images of the plate: ``pixels`` (c, m, 2), and the worst measures over markers and cameras used.
 
-    ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine of the angle at which a
-    camera sees the plate's normal, negative where it sees the back.
+    ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine between a camera's line
+    of
+    sight and the plate's normal, negative if it sees the back.
     """
 
     pixels: FloatArray
@@ -43,7 +44,7 @@ class PlateView(NamedTuple):
 
 
 def sight(pose: FloatArray, cameras: int = len(MATRICES)) -> PlateView:
-    """View of the plate at ``pose`` (4, 4) in all images; measures of those of the first ``cameras``."""
+    """View of the plate at ``pose`` (4, 4) in all images; measures are those of the first ``cameras``."""
     return PlateView(*_sight(MATRICES, EYES, HOMOGENEOUS_MARKERS, pose, cameras))
 
 
@@ -75,7 +76,7 @@ def _sight(
             if c >= used:
                 continue
             nearest = min(nearest, x[2])
-            # The last pixel that is in view lies just below the image's size.
+            # The last visible pixel coordinate is just below the image's size.
             margin = min(margin, u, v, np.nextafter(WIDTH, 0.0) - u, np.nextafter(HEIGHT, 0.0) - v)
     for c in range(used):
         along, length = 0.0, 0.0
@@ -94,9 +95,9 @@ def error_px(pixels: FloatArray, set_points: FloatArray, cameras: int) -> float:
 
 
 def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> FloatArray:
-    """Distances (k,) [m] of the plate's centre in ``poses`` (k, 4, 4) from the line from ``start`` to ``goal``.
+    """Distances (k,) [m] of the plate's centre in ``poses`` (k, 4, 4) from the line segment from ``start`` to ``goal``.
 
-    From the segment: what is overshot counts.
+    Distances are to the segment, so that overshoot counts.
     """
     a, b = start[:3, 3], goal[:3, 3]
     offset = b - a
@@ -107,10 +108,11 @@ def line_deviations(poses: FloatArray, start: FloatArray, goal: FloatArray) -> F
 
 
 def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, cameras: int) -> float:
-    """Expected largest error over markers [px] of a loop at rest by image noise.
+    """Expected largest error over markers [px], due to image noise, of a loop at rest.
 
-    The pose of least squares of each frame alone has the covariance ``σ²(JᵀJ)⁻¹``; a loop in which an error decays by
-    ``exp(-gain·dt)`` a step lets ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it through. The mean over its directions
+    The least-squares pose of each single frame has the covariance ``σ²(JᵀJ)⁻¹``. A loop in which an error decays by
+    ``exp(-gain·dt)`` a step passes the share ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it. The mean over its
+    directions
     is taken from 4096 fixed draws.
     """
     if noise_px == 0.0:

@@ -1,8 +1,8 @@
-"""Hard alignment tasks: up to 180° and 0.6 m, near the image borders, such that the straight path leaves the view.
+"""Hard alignment tasks: up to 180° and 0.6 m, near the image borders, whose straight path leaves the view.
 
-``python -m stereoservo_sim.tasks.hard_tasks`` writes `tasks_hard.csv` beside this module; the same seed, the same file.
-Both end poses are visible in both cameras. Tasks are drawn until their straight way is of the kind whose turn it is
-(`KINDS`). A third of all turn by 150° to 180°, every tenth by 180° exactly.
+``python -m stereoservo_sim.tasks.hard_tasks`` writes `tasks_hard.csv` beside this module, reproducible by its seed.
+Both end poses are visible in both cameras. Tasks are drawn until their straight path is of the required kind, one after
+another of `KINDS`. A third of all rotate by 150° to 180°, every tenth by 180° exactly.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stereoservo_sim.tasks.task_file import AlignmentTask, tasks_text
 SEED = 20_010_801
 COUNT = 120
 BORDER_PX = 6.0
-"""End poses keep their markers this far inside the images."""
+"""Least distance of the end poses' markers from the image borders."""
 MAX_VIEW_ANGLE_DEG = 78.0
 MAX_DISTANCE_M, MAX_ANGLE_DEG = 0.6, 180.0
 DEPTHS_M, ASIDE_M, DOWN_M = (0.45, 1.6), 0.45, 0.35
@@ -29,7 +29,9 @@ NEAR_PX = 20.0
 STEPS = 41
 FIRST_ID = 5000
 KINDS = ("leaves the view", "near a border", "shows the back", "as it comes")
-"""In turn: of the way on which the middle goes straight and the plate turns about one axis, by the shorter rotation."""
+"""Kinds of straight path, used in turn; on it the centre moves straight and the plate rotates about one axis, by the
+shorter rotation.
+"""
 
 
 def shipped_tasks_path() -> Path:
@@ -52,7 +54,7 @@ def _task(seed: int, number: int) -> AlignmentTask:
         shift = rng.uniform(0.05, MAX_DISTANCE_M) * _direction(rng)
         axis = _direction(rng)
         if kind == "leaves the view":
-            # Both ends close to the same border, the plate turning before it: corners swing out on the way.
+            # Both ends are close to the same border, and the plate rotates near it: corners swing out on the path.
             axis = goal[:3, 2] + 0.4 * axis
             axis /= np.linalg.norm(axis)
         start[:3, :3] = Rotation.from_rotvec(np.radians(angle) * axis).as_matrix() @ goal[:3, :3]
@@ -93,7 +95,7 @@ def _pushed(pose: FloatArray, aside: FloatArray, rng: np.random.Generator) -> Fl
 def _angle(rng: np.random.Generator, number: int, kind: str) -> float:
     if number % 10 == 9:
         return MAX_ANGLE_DEG
-    if number % 3 == 0 or kind == "shows the back":  # small turns hardly ever show it
+    if number % 3 == 0 or kind == "shows the back":  # small rotations hardly ever show the back
         return float(rng.uniform(150.0, MAX_ANGLE_DEG))
     return float(rng.uniform(0.0, 150.0))
 
@@ -101,7 +103,7 @@ def _angle(rng: np.random.Generator, number: int, kind: str) -> float:
 def straight_path_margins(start: FloatArray, goal: FloatArray) -> tuple[float, float]:
     """Least distance from the image borders [px] and least cosine to the plate's normal on the straight path.
 
-    The middle goes on its line while the plate turns about one axis, the shorter way round.
+    The centre moves straight while the plate rotates about one axis, by the shorter rotation.
     """
     turn = Rotation.from_matrix(goal[:3, :3] @ start[:3, :3].T).as_rotvec()
     margin, facing = np.inf, np.inf

@@ -1,8 +1,8 @@
 """The controller's estimate of the markers in its projective frame: predicted by kinematics, corrected by pixels.
 
-As in the running cell: the innovation of all markers becomes one displacement of the body, of which each frame makes a
-share, so that noise is averaged over ``FILTER_S`` and a camera that drops out leaves the prediction to go on with. The
-weak directions of a single camera are corrected less: what the other cameras have told counts as if it were seen.
+As in the running cell, the innovation of all markers is reduced to one displacement of the body, of which each frame
+applies a share. Noise is thus averaged over ``FILTER_S``, and a camera that drops out leaves a prediction to continue
+with. The weak directions of a single camera are corrected less: earlier observations of the others keep their weight.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from stereoservo_sim.tasks.calibrations import Knowledge
 PointsName = Literal["predicted", "triangulated"]
 
 FILTER_S, REST_FILTER_S = 0.5, 2.0
-"""Over which innovations are averaged, moving and at rest, where no error of the kinematics comes in; at the start over
-all frames there have been."""
+"""Averaging time of innovations, moving and at rest (without new kinematic errors); at the start over all frames so
+far.
+"""
 REST_PX_S = 5.0
-"""A body whose markers go slower in all images is at rest."""
+"""A body whose markers are slower in all images is at rest."""
 DAMPING = 1e-9
 FIRST_ROUNDS = 5
 
@@ -56,7 +57,7 @@ class MarkerEstimate:
         self._rests = bool(np.abs(after - before).max() < REST_PX_S * self._dt_s)
 
     def seen(self, pixels: FloatArray, weights: FloatArray) -> None:
-        """Correct by a frame of every camera: pixels (c, m, 2), weights (c, m), 0 where a marker is not seen."""
+        """Correct by a frame of every camera: pixels (c, m, 2), weights (c, m), 0 if a marker is not seen."""
         if self.triangulates:
             self._triangulate(pixels, weights)
             return
@@ -70,7 +71,7 @@ class MarkerEstimate:
         share = 1.0 / self._frames
         self.points = corrected(basis, matrices, self.points, pixels, weights, share)
         predicted, _ = project_points(matrices, self.points)
-        # What no displacement explains is averaged marker by marker.
+        # The part that no displacement explains is averaged for each marker.
         self._residual += np.where(weights[..., None] > 0.0, share * (pixels - predicted - self._residual), 0.0)
         self.pixels = predicted + self._residual
 
@@ -95,7 +96,7 @@ def corrected(
     """Points (m, 4) displaced by ``share`` of the least-squares displacement for ``pixels`` (c, m, 2), ``basis``
     (r, 4, 4).
 
-    The prediction counts as ``1/share - 1`` frames of all cameras; cameras of weight 0 say nothing now.
+    The prediction counts as ``1/share - 1`` frames of all cameras; cameras of weight 0 contribute nothing now.
     """
     cameras, markers, freedoms = matrices.shape[0], points.shape[0], basis.shape[0]
     jacobian = image_jacobian(basis, matrices, points)

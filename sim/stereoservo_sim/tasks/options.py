@@ -1,12 +1,12 @@
-"""Options of a campaign that its command states before it imports anything heavier: defaults, and the error of options
-that do not fit.
+"""Options of a campaign, separate so that its command can state them without heavy imports: defaults, and the error of
+invalid options.
 """
 
 from __future__ import annotations
 
 DEFAULT_RATE_HZ, DEFAULT_GAIN = 25.0, 0.5
 STOPS, FRAMES = 41, 25
-"""Of trial motions: stops a joint, and frames averaged at each."""
+"""Of the calibration motion: stops per joint, and frames averaged at each."""
 
 
 class SettingsError(Exception):

@@ -11,12 +11,12 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 
 MAX_ANGLE_DEG, MAX_DISTANCE_M = 150.0, 0.4
 BORDER_PX, MAX_VIEW_ANGLE_DEG = 20.0, 75.0
-"""End poses keep their markers this far inside the images, and are seen at less than this angle from the normal."""
+"""Least distance of the end poses' markers from the image borders, and largest angle from the plate's normal."""
 ASIDE_M, DOWN_M, DEPTHS_M = 0.25, 0.2, (0.8, 1.4)
 
 
 def random_tasks(seed: int, count: int) -> tuple[AlignmentTask, ...]:
-    """Random tasks; angle and distance are drawn once a task, the rest until both ends are visible."""
+    """Random tasks; angle and distance are drawn once per task, the rest until both ends are visible."""
     rng = np.random.default_rng(seed)
     tasks: list[AlignmentTask] = []
     while len(tasks) < count:

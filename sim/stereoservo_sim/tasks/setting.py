@@ -1,6 +1,6 @@
-"""Scene of task files v1, as their head comments specify it: two cameras, a plate of four markers, limits.
+"""Scene of task files v1, as specified by their head comments: two cameras, a plate of four markers, limits.
 
-Rig frame: the middle of the baseline, x from the left to the right camera, z ahead [m]. Plate: its printed face looks
+Rig frame: origin mid-baseline, x from the left to the right camera, z ahead [m]. Plate: its printed face looks
 along -z.
 """
 
@@ -12,21 +12,21 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.synthetic import rotation, translation
 
 FOCAL, CENTRE_U, CENTRE_V = 800.0, 320.0, 240.0
-"""[px]"""
+"""Intrinsic parameters [px]."""
 WIDTH, HEIGHT = 640, 480
-"""A point is in view where 0 <= u < 640 and 0 <= v < 480."""
+"""Image size: a point is in view if 0 <= u < 640 and 0 <= v < 480."""
 BASELINE, YAW_DEG = 0.20, 10.0
-"""[m], and how far each camera is turned inwards [°]."""
+"""Baseline [m], and inward rotation of each camera [°]."""
 MARKERS = np.array([(-0.05, -0.05, 0.0), (0.05, -0.05, 0.0), (0.05, 0.05, 0.0), (-0.05, 0.05, 0.0)])
-"""(4, 3) in the plate's frame [m]."""
+"""Markers (4, 3) in the plate's frame [m]."""
 FACE = np.array([0, 1, 2], dtype=np.int64)
 """Three markers that span the face."""
 MIN_DEPTH = 0.01
-"""A marker nearer to a camera's plane than this is behind it [m]."""
+"""Least depth [m]: a marker nearer to a camera's plane counts as behind it."""
 SUCCESS_PX = 0.5
 MAX_ITERATIONS = 2000
 FOCAL_ERROR, HAND_EYE_ERROR_DEG = 0.1, 5.0
-"""Of the coarse calibration: share of the focal length, angle about the task's own axis."""
+"""Errors of the coarse calibration: share of the focal length, angle about the task's own axis."""
 
 HOMOGENEOUS_MARKERS = np.hstack([MARKERS, np.ones((4, 1))])
 

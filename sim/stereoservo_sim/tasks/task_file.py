@@ -16,10 +16,10 @@ from stereoservo_sim.tasks.setting import CENTRE_U, CENTRE_V, FOCAL, HEIGHT, MAR
 MAX_BYTES = 64 * 2**20
 MAX_TASKS = 100_000
 RIGID_TOLERANCE = 1e-6
-"""How far RᵀR may be from the identity, and the last row from (0, 0, 0, 1)."""
+"""Largest difference of RᵀR from the identity, and of the last row from (0, 0, 0, 1)."""
 UNIT_TOLERANCE = 1e-3
 STATED_TOLERANCE = 1e-9
-"""How far a camera's stated pose may be from the one that v1 fixes."""
+"""Largest difference of a camera's stated pose from the one fixed by v1."""
 VERSION_LINE = "stereoservo benchmark tasks v"
 VERSION = "1"
 MAX_ID = 2**53
@@ -35,7 +35,7 @@ class TaskFileError(Exception):
 
     Attributes:
         code: ``task_file``.
-        line, column: where, from 1 and by name; 0 and empty where it is the file as a whole.
+        line, column: position, from 1 and by name; 0 and empty if it is the file as a whole.
     """
 
     code = "task_file"
@@ -52,7 +52,7 @@ class AlignmentTask:
     """Task: move the plate from ``start`` to ``goal``, (4, 4) poses in the rig's frame.
 
     ``error_axis`` (3,): unit axis of the hand-eye error of the coarse calibration. ``angle_deg``, ``distance_m``: of
-    the way, as the file states them.
+    the path, as stated in the file.
     """
 
     id: int
@@ -112,7 +112,7 @@ def _lines(path: Path) -> Iterator[tuple[int, str]]:
 
 
 def _check_comment(path: Path, number: int, line: str) -> None:
-    """Check that a comment on the scene agrees with v1: other cameras would make other tasks."""
+    """Check that a comment on the scene agrees with v1, since other cameras would give other tasks."""
     text = line.lstrip("#").strip()
     if text.startswith(VERSION_LINE):
         version = text.removeprefix(VERSION_LINE).split()[0] if text != VERSION_LINE else ""

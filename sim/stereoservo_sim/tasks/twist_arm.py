@@ -1,8 +1,8 @@
-"""The tasks' RX 90 behind an interface of Cartesian velocities: six virtual joints, a controller of its own.
+"""The tasks' RX 90 behind an interface of Cartesian velocities: six virtual joints, with its own controller.
 
-The driver's kit (`kit.cartesian`) over the controller of driver ``twist`` over ideal velocity drives, in virtual time:
-twists leak a little into other directions, are ramped and scaled down, and the controller stops the arm by itself near
-a singularity and at a joint's limit, of which the service knows nothing.
+The driver's kit (`kit.cartesian`) over the controller of driver ``twist`` over ideal velocity drives, in virtual time.
+Twists leak slightly into other directions, are ramped and scaled down, and the controller stops the arm by itself near
+a singularity and at a joint's limit, neither of which is known to the service.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from stereoservo_sim.world.robots import Robot, flange_pose
 from stereoservo_sim.world.synthetic import SyntheticCell
 
 BOX, TURNS = 0.8, (1.6, 1.35, 6.2)
-"""Of the virtual joints, to either side of mid-range [m], and about the tool's x, y, z [rad]."""
+"""Ranges of the virtual joints to either side of mid-range [m], and about the tool's x, y, z [rad]."""
 SPEEDS, ACCELERATIONS = (0.25, 1.0), (1.0, 4.0)
-"""Of slides and turns [m/s, rad/s; m/s², rad/s²]."""
+"""Limits of translations and rotations [m/s, rad/s; m/s², rad/s²]."""
 CONTROLLER_SPEEDS = (0.5, 2.0)
-"""To which the controller scales twists down: more than three slides, or turns, are together."""
+"""Speeds to which the controller scales twists down: more than three translations, or rotations, give together."""
 JOINT_SPEED, JOINT_ACCELERATION = 4.0, 20.0
-"""Of the RX 90's own joints [rad/s, rad/s²]."""
+"""Limits of the RX 90's own joints [rad/s, rad/s²]."""
 RATE_HZ = 250.0
-"""Of the interface."""
+"""Rate of the interface."""
 STRIDE = 0.02, 0.08
-"""Between poses of a rehearsed way at most [m, rad]."""
+"""Largest distance between poses of a tested path [m, rad]."""
 CLEAR_OF_LIMIT, CLEAR_OF_SINGULARITY = LIMIT_MARGIN + 0.05, 3.0 * SINGULAR
-"""What a rehearsed way keeps, beyond where the controller stops [rad; smallest over largest singular value]."""
+"""Clearance of a tested path, beyond where the controller stops [rad; smallest over largest singular value]."""
 
 
 class TwistArm:
@@ -55,7 +55,7 @@ class TwistArm:
         self._history = TrueJointHistory.in_memory(6, 64)
         context = DriverContext(
             self._clock, "tasks", Path(), Path(), services={"world": self._history}
-        )  # nothing is read from files
+        )  # no files are read
         joints = [
             {
                 "name": joint.name,
@@ -81,7 +81,7 @@ class TwistArm:
         self.joints = self._driver.read_state().positions
 
     def move(self, velocity: FloatArray, dt_s: float) -> None:
-        """Command ``velocity`` (6,) once a cycle of the interface. Raises DriverError where the arm has stopped."""
+        """Command ``velocity`` (6,) once per cycle of the interface. Raises DriverError if the arm has stopped."""
         cycles = max(1, round(dt_s * RATE_HZ))
         for _ in range(cycles):
             self._driver.write_velocity(velocity)
@@ -90,7 +90,7 @@ class TwistArm:
 
     @property
     def pose(self) -> FloatArray:
-        """Where the plate truly is."""
+        """True pose of the plate."""
         newest = self._history.newest()
         assert newest is not None  # the driver is configured
         pose: FloatArray = self._rig @ flange_pose(self._robot, newest[1])
@@ -110,7 +110,7 @@ def _placed() -> tuple[FloatArray, Robot]:
 
 
 def attitude(rig_from_base: FloatArray) -> FloatArray:
-    """The attitude (3, 3), base from plate, about which turns are counted: the plate faces the cameras' middle."""
+    """Attitude (3, 3), base from plate, at which rotations are zero: the plate faces the point between the cameras."""
     facing: FloatArray = rig_from_base[:3, :3].T
     return facing
 
@@ -141,9 +141,9 @@ def twist_cell() -> SyntheticCell:
 
 
 def twist_start(way: FloatArray) -> FloatArray | None:
-    """The RX 90's joints (6,) at the beginning of a way (k, 4, 4) of the plate.
+    """The RX 90's joints (6,) at the start of a path (k, 4, 4) of the plate.
 
-    Of several configurations the one that stays farthest from singularities; None where none can go the way clear of
+    Of several configurations the one that stays farthest from singularities; None if none can follow the path clear of
     its limits and singularities.
     """
     rig, robot = _placed()
@@ -155,7 +155,7 @@ def twist_start(way: FloatArray) -> FloatArray | None:
 
 
 def _dense(way: FloatArray) -> FloatArray:
-    """Poses on a way (k, 4, 4) that are no farther apart than `STRIDE`, on a line and about an axis between two."""
+    """Poses on a path (k, 4, 4) at most `STRIDE` apart, interpolated on a line and about one axis between two."""
     poses, last = [way[0]], way[0]
     for pose in way[1:]:
         turn = Rotation.from_matrix(pose[:3, :3] @ last[:3, :3].T).as_rotvec()
@@ -173,10 +173,10 @@ def _dense(way: FloatArray) -> FloatArray:
 
 
 def _clearance(robot: Robot, q: FloatArray, way: FloatArray) -> float:
-    """Least ratio of the arm's singular values on a way (k, 4, 4) from ``q`` (6,) on; 0 where it is not clear."""
+    """Least ratio of the arm's singular values on a path (k, 4, 4) from ``q`` (6,) on; 0 if it is not clear."""
     low, high = RX90_LIMITS[:, 0] + CLEAR_OF_LIMIT, RX90_LIMITS[:, 1] - CLEAR_OF_LIMIT
     least = 1.0
-    # So near to each other that a step of Newton's brings the arm to the next; it is looked at in the last one, too.
+    # Poses are so close that one Newton step brings the arm to the next; the last pose is checked, too.
     for pose in [*way, way[-1]]:
         there = flange_pose(robot, q)
         u, values, vt = np.linalg.svd(body_jacobian(robot, q, there[:3, 3]))

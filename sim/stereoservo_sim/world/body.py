@@ -1,5 +1,5 @@
-"""The marker body on the flange, as ground truth: planar faces with dots, joined like a shallow roof; or a convex solid
-without markers, its vertices with ids.
+"""The marker body on the flange, as ground truth: planar faces with dots, joined like a shallow roof; or a convex
+solid without markers, whose vertices have ids.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class MarkerBody:
 
     @property
     def marker_points(self) -> FloatArray:
-        """Dot centres in the flange's frame, (m, 3) [m], rows as ``ids``."""
+        """Dot centres in the flange's frame, (m, 3) [m], rows in the order of ``ids``."""
         return np.concatenate(
             [
                 face.positions @ pose[:3, :2].T + pose[:3, 3]
@@ -63,14 +63,14 @@ def roof_body(
     shift: tuple[float, float] = (0.02, 0.01),
     roll: float = 0.0,
 ) -> MarkerBody:
-    """Two faces side by side, ridge towards the viewer, each inclined by ``tilt`` [rad].
+    """Body of two faces side by side, ridge towards the viewer, each inclined by ``tilt`` [rad].
 
     Args:
         faces: left and right face as seen from in front.
         tilt: inclination of each face about the ridge [rad].
         stand_off: distance of the ridge from the flange along its z axis [m].
         shift: offset of the ridge across the flange's axis [m].
-        roll: turn of the body about the flange's z axis [rad].
+        roll: rotation of the body about the flange's z axis [rad].
     """
     c, s = np.cos(roll), np.sin(roll)
     # Seen from in front (looking along -z of the flange): right and down are across, into the body is -z.
@@ -88,17 +88,17 @@ def roof_body(
 
 FIRST_ID = 400
 LIGHT = (-0.6, -0.6, 0.8)
-"""Towards the lamp of the embedded cell, above and behind its cameras."""
+"""Direction to the lamp of the embedded cell, above and behind its cameras."""
 AMBIENT, SKY, DIFFUSE = 25.0, 60.0, 130.0
-"""Grey levels of a face in no light, what the sky adds to one that looks up, and the lamp to one that looks at it."""
+"""Grey levels: of an unlit face, added by the sky to a face turned up, and added by the lamp to one that faces it."""
 
 
 @dataclass(frozen=True, eq=False)
 class SolidBody(MarkerBody):
-    """A convex solid in the flange's frame, in place of plates with dots: its markers are its vertices.
+    """A convex solid in the flange's frame, used instead of plates with dots; its vertices are the markers.
 
-    ``vertices`` (n, 3) [m] with ids from ``first_id`` on; ``outlines``: rows of vertices along each face's border;
-    ``light`` (3,): towards the lamp, in the world.
+    ``vertices`` (n, 3) [m] with ids from ``first_id`` on; ``outlines``: vertex indices along each face's border;
+    ``light`` (3,): direction to the lamp, in the world.
     """
 
     vertices: FloatArray
@@ -129,7 +129,7 @@ class SolidBody(MarkerBody):
 
     @property
     def marker_normals(self) -> FloatArray:
-        """Mean unit normal of the faces that meet in each vertex, (n, 3)."""
+        """Mean unit normal at each vertex of the faces that meet there, (n, 3)."""
         faces = self.face_normals
         touching = np.array([[row in outline for outline in self.outlines] for row in range(len(self.vertices))])
         normals = touching.astype(np.float64) @ faces
@@ -138,7 +138,7 @@ class SolidBody(MarkerBody):
 
     @property
     def marker_radii(self) -> FloatArray:
-        """Vertices have no extent, (n,)."""
+        """Radii (n,): zero, since vertices have no extent."""
         return np.zeros(len(self.vertices))
 
     def shades(self, pose: FloatArray) -> FloatArray:
@@ -160,7 +160,7 @@ def wedge(first_id: int = FIRST_ID, *, scale: float = 1.0, height: tuple[float, 
     offsets = (inward * WEDGE_BASE).sum(axis=1) + WEDGE_INSETS
     top = [
         np.linalg.solve(inward[[k - 1, k]], offsets[[k - 1, k]]) for k in range(len(WEDGE_BASE))
-    ]  # sides stay plane: edges of the top are parallel to those of the base
+    ]  # sides stay planar: edges of the top are parallel to those of the base
     count = len(WEDGE_BASE)
     base = np.column_stack([scale * WEDGE_BASE, np.full(count, height[0])])
     upper = np.column_stack([scale * np.array(top), np.full(count, height[0] + scale * (height[1] - height[0]))])

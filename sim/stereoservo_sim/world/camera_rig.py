@@ -1,6 +1,6 @@
 """Simulated cameras: pinholes with radial lens distortion. Pixels: integer = pixel centre.
 
-Ideal pixels are a pinhole's, ``K`` on rays; raw ones are those of the image, which the lens has bent.
+Ideal pixels are those of a pinhole (``K`` times rays); raw pixels are those of the distorted image.
 """
 
 from __future__ import annotations
@@ -28,19 +28,20 @@ class PinholeCamera:
 
     @property
     def lens(self) -> FloatArray:
-        """``(k, cu, cv, r0)`` (4,), as `stereoservo.geometry.distortion` has it; square pixels are assumed."""
+        """Lens parameters ``(k, cu, cv, r0)`` (4,) as in `stereoservo.geometry.distortion`, for square pixels."""
         r0 = 0.5 * self.width
         return np.array([self.k1 * r0**2 / (self.K[0, 0] * self.K[1, 1]), self.K[0, 2], self.K[1, 2], r0])
 
     @property
     def sees_whole_image(self) -> bool:
-        """Whether the lens's image reaches every corner; with a strong negative ``k1`` it ends before."""
+        """Whether the distorted image covers every corner; with a strong negative ``k1`` it ends before."""
         return self.k1 > self.least_k1
 
     @property
     def least_k1(self) -> float:
-        """The ``k1`` with which the lens's image just reaches the farthest corner: there 27/4 |k| s² = 1, s the raw
-        radius.
+        """The least ``k1`` with which the distorted image just reaches the farthest corner: there 27/4 |k| s² = 1, with
+        s the
+        raw radius.
         """
         right, bottom = self.width - 0.5, self.height - 0.5
         corners = np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)])
@@ -48,12 +49,12 @@ class PinholeCamera:
         return float(-4.0 / (27.0 * farthest))
 
     def image_of(self, points: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Raw pixels (n, 2) and depths (n,) [m] of points (n, 3) in the world; NaN beyond the lens's fold."""
+        """Raw pixels (n, 2) and depths (n,) [m] of points (n, 3) in the world; NaN beyond the distortion's fold."""
         ideal, depths = project(self.P, points)
         return (distort(self.lens, ideal) if self.k1 != 0.0 else ideal), depths
 
     def moved(self, pose: FloatArray) -> PinholeCamera:
-        """This camera, mounted in a frame of ``pose`` (4, 4) in the world, as a camera in the world."""
+        """This camera in the world, if it is mounted in a frame of ``pose`` (4, 4) in the world."""
         return replace(self, world_to_camera=self.world_to_camera @ inverse_pose(pose))
 
     def moved_by(self, displacement: FloatArray) -> PinholeCamera:
@@ -61,7 +62,7 @@ class PinholeCamera:
         return replace(self, world_to_camera=inverse_pose(displacement) @ self.world_to_camera)
 
     def focused(self, factor: float) -> PinholeCamera:
-        """This camera with its focal length times ``factor``."""
+        """This camera with its focal length multiplied by ``factor``."""
         if factor == 1.0:
             return self
         K = self.K.copy()
@@ -82,7 +83,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True, eq=False)
 class StereoRig:
-    """Cameras left first, and the rig's own frame: origin mid-baseline, x along it, z towards the scene.
+    """Stereo rig: cameras, left first, and the rig's own frame (origin mid-baseline, x along it, z towards the scene).
 
     Poses are from the world, or from the flange that carries the rig.
     """

@@ -1,6 +1,6 @@
-"""The simulated conveyor: a belt that carries the marked part past the arm, straight and at one speed.
+"""The simulated conveyor: a belt that carries the marked part past the arm, straight and at constant speed.
 
-It has no process of its own: where the part is, is in the file of the runtime directory that moves targets
+It has no process of its own. The part's motion is in the file of the runtime directory that moves targets
 (`stereoservo_sim.world.workpiece`), so that cameras in any process, the demonstration and a shell agree on it.
 """
 
@@ -16,17 +16,21 @@ from stereoservo_sim.world.workpiece import Metres, Motion, Moved
 
 NAME = "conveyor"
 AWAY = Moved((0.0, 0.0, -5.0))
-"""Nobody has put a part onto the belt."""
+"""Displacement of the part while none is on the belt."""
 
 
 class ConveyorError(Exception):
-    """A cell file states no conveyor, or one that cannot be; the text says what would be valid."""
+    """A cell file states no conveyor, or an invalid one; the text states what would be valid."""
 
 
 class Conveyor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Section ``[emulate.conveyor]``: a part is put onto the belt at ``begin_m`` [m] from where it stands in the cell,
-    and carried at ``velocity_m_s`` [m/s], in the world's axes, for ``for_s``; then the belt stands. ``every_s``: so
-    long after it the next part sets out at ``begin_m``; None: there is one part.
+    """Section ``[emulate.conveyor]``: motion of parts on the belt, in the world's axes.
+
+    A part is put onto the belt at ``begin_m`` [m] from its initial position in the cell, and carried at
+    ``velocity_m_s``
+    [m/s] for ``for_s``; then the belt stops. ``every_s``: interval after which the next part starts at ``begin_m``;
+    None:
+    there is one part.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres]
@@ -36,11 +40,11 @@ class Conveyor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
     @property
     def begin(self) -> Moved:
-        """Where a part is put onto the belt."""
+        """Displacement at which a part is put onto the belt."""
         return Moved(self.begin_m)
 
     def running(self, since_ns: int) -> Motion:
-        """The part's motion with the belt on from the monotonic time ``since_ns`` [ns]."""
+        """The part's motion on the belt running from the monotonic time ``since_ns`` [ns]."""
         return Motion(
             shift_m=self.begin_m,
             velocity_m_s=self.velocity_m_s,
@@ -51,7 +55,7 @@ class Conveyor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def conveyor_of(cell: CellFile) -> Conveyor | None:
-    """The conveyor of a cell, None where it has none. Raises ConveyorError where what is stated is invalid."""
+    """The conveyor of a cell, None if it has none. Raises ConveyorError if it is invalid."""
     given = cell.emulate.get(NAME)
     if given is None:
         return None

@@ -12,8 +12,9 @@ import numpy.typing as npt
 from stereoservo.numerics.compilation import kernel
 
 LINES = 16
-"""Lines a pixel row, or the part of it that a shape reaches, on which spans are exact; between them the
-midpoint rule."""
+"""Lines per pixel row, or per part of it that a shape covers, on which spans are exact; between them the midpoint
+rule.
+"""
 
 
 @kernel

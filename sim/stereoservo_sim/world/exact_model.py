@@ -36,11 +36,11 @@ def exact_model(
     stratum: Stratum = "metric",
     plane: tuple[float, float, float, float] = (0.05, -0.03, 0.4, 0.3),
 ) -> CellModel:
-    """Model of ``cell`` in the canonical projective frame with ``plane`` as its plane at infinity; ``zero``: home
-    if None.
+    """Model of ``cell`` in the canonical projective frame with ``plane`` as its plane at infinity.
 
-    ``plane`` must not pass between the markers as seen from the left camera; the default stays clear of them for
-    cameras of ordinary focal lengths. ``stratum`` of the model.
+    ``plane`` must not pass between the markers as seen from the left camera; the default is clear of them for cameras
+    of
+    ordinary focal lengths. ``zero``: joint zeros, home if None. ``stratum``: of the model.
     """
     zero = cell.home if zero is None else zero
     normaliser = pixel_normaliser(cell.width, cell.height)
@@ -71,7 +71,7 @@ def exact_model(
 
 
 def exact_simulated_model(cell: SimulatedCell, seed: int) -> CellModel:
-    """Model of the simulated cell with its base as zero, in a projective frame that ``seed`` draws."""
+    """Model of the simulated cell with its base as zero, in a projective frame drawn with ``seed``."""
     frames, flange = joint_frames(cell.robot, cell.base)
     generators = np.zeros((len(cell.base), 4, 4))
     for twist, frame, joint in zip(generators, frames, cell.robot.joints, strict=True):
@@ -82,7 +82,7 @@ def exact_simulated_model(cell: SimulatedCell, seed: int) -> CellModel:
         twist[:3, :3] = [(0, -z, y), (z, 0, -x), (-y, x, 0)]
         twist[:3, 3] = -twist[:3, :3] @ frame[:3, 3]
     points = np.column_stack([cell.marker_positions(cell.base), np.ones(len(cell.body.ids))])
-    if cell.stand is not None:  # everything as the flange sees it
+    if cell.stand is not None:  # everything in the flange's frame
         back = np.linalg.inv(flange)
         generators = -back @ generators @ flange
         points = points @ back.T

@@ -1,9 +1,8 @@
 """History of the true joint positions, written by the simulated arm, read by simulated cameras and for evaluation.
 
-A ring of samples in a memory-mapped file, so that a camera in another process can show the arm exactly at
-its shutter time, and so that a demonstration can be judged against what the arm really did. One writer,
-any readers. Python cannot fence memory, so each sample carries a check sum: a reader takes none that does
-not fit.
+A ring of samples in a memory-mapped file. A camera in another process can show the arm exactly at its shutter time,
+and a demonstration can be evaluated against the arm's true motion. One writer, any number of readers. Python has no
+memory fences, so each sample carries a checksum: a reader ignores a sample whose checksum does not match.
 """
 
 from __future__ import annotations
@@ -65,7 +64,7 @@ class TrueJointHistory:
 
     @classmethod
     def create(cls, path: Path, joints: int, *, now_ns: int, capacity: int = CAPACITY) -> TrueJointHistory:
-        """Open for writing. Continues an existing file of this layout whose samples are not from the future.
+        """Open for writing. Continues an existing file of this layout unless its samples are from the future.
 
         Raises:
             HistoryError: the file cannot be created.
@@ -95,8 +94,8 @@ class TrueJointHistory:
 
     @classmethod
     def open(cls, path: Path) -> TrueJointHistory:
-        """Open for reading (or for the writer, where the file exists). Raises HistoryError where the file is
-        missing or invalid.
+        """Open for reading (or for the writer, if the file exists). Raises HistoryError if the file is missing or
+        invalid.
         """
         try:
             with path.open("r+b") as file:
@@ -115,16 +114,16 @@ class TrueJointHistory:
 
     @property
     def count(self) -> int:
-        """Samples ever written; the newest has index ``count - 1``."""
+        """Number of samples ever written; the newest has index ``count - 1``."""
         return int(struct.unpack_from("<Q", self._buffer, _COUNT_AT)[0])
 
     @property
     def newest_ns(self) -> int:
-        """Time of the newest sample as its writer knows it; -1 before the first."""
+        """Time of the newest sample as stored by its writer; -1 before the first."""
         return self._last_ns
 
     def append(self, t_ns: int, positions: FloatArray, velocities: FloatArray) -> None:
-        """Write one sample (n,), (n,); a sample that is not newer than the last is ignored."""
+        """Write one sample of positions (n,) and velocities (n,); ignored if it is not newer than the last."""
         if t_ns <= self._last_ns:
             return
         index = self.count
@@ -136,9 +135,7 @@ class TrueJointHistory:
         self._last_ns = t_ns
 
     def sample(self, index: int) -> tuple[int, FloatArray, FloatArray] | None:
-        """Sample ``index`` as (t_ns, positions, velocities), or None where it is overwritten or being
-        written.
-        """
+        """Sample ``index`` as (t_ns, positions, velocities); None if it is overwritten or being written."""
         at = self._at(index)
         data = bytes(self._buffer[at : at + self._body.size + 4])
         fields = self._body.unpack_from(data, 0)
@@ -155,8 +152,8 @@ class TrueJointHistory:
         return None
 
     def at(self, t_ns: int) -> FloatArray | None:
-        """Positions (n,) at ``t_ns``, cubic between samples; the first sample before it; None after the
-        newest.
+        """Positions (n,) at ``t_ns``, by cubic interpolation; before the first sample: its positions; after the newest:
+        None.
         """
         count = self.count
         if count == 0 or t_ns > self._time(count - 1):
@@ -177,7 +174,7 @@ class TrueJointHistory:
         return _hermite(before, after, t_ns)
 
     def since(self, index: int) -> tuple[int, IntArray, FloatArray]:
-        """Samples from ``index`` on that are still held: (next index, times (k,) [ns], positions (k, n))."""
+        """Samples from ``index`` on that are still stored: (next index, times (k,) [ns], positions (k, n))."""
         count = self.count
         first = max(index, count - self.capacity + 1, 0)
         samples = [s for i in range(first, count) if (s := self.sample(i)) is not None]
@@ -214,5 +211,5 @@ def _hermite(
 ) -> FloatArray:
     h = (after[0] - before[0]) * 1e-9
     s = (t_ns - before[0]) / (after[0] - before[0])
-    way = s * s * (3 - 2 * s) * (after[1] - before[1])  # exactly none of an arm that stands
+    way = s * s * (3 - 2 * s) * (after[1] - before[1])  # exactly zero for an arm at rest
     return before[1] + way + s * (1 - s) * h * ((1 - s) * before[2] - s * after[2])

@@ -1,7 +1,7 @@
-"""Light and exposure that change: ambient steps, an automatic exposure, soft shadows, a lamp's reflection, flicker.
+"""Varying light and exposure: ambient steps, automatic exposure, soft shadows, a lamp's reflection, flicker.
 
-It is laid over the picture of a scene before the sensor's noise and its 255 levels, so that what is too bright is cut
-off, and what is too dark drowns in noise.
+It is applied to the image of a scene before the sensor's noise and quantisation to 255 levels, so that bright areas
+are clipped, and dark ones are lost in noise.
 """
 
 from __future__ import annotations
@@ -17,20 +17,26 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Positive = Annotated[float, Meta(gt=0)]
 Share = Annotated[float, Meta(ge=0, le=0.95)]
 SLANT = 0.35
-"""Inclination of a shadow's edges to the picture's columns [rad]."""
+"""Inclination of a shadow's edges to the image columns [rad]."""
 Picture = npt.NDArray[np.float32]
 
 
 class Lighting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How light changes, by the time since the camera was activated.
+    """Light variation as a function of the time since the camera was activated.
 
-    ``level``: of all light, 1 is that of the scene without this. ``steps``: (s, level) from which on the ambient light
-    is as stated; ``adapt_s``: time constant of an automatic exposure that follows it, 0: fixed. ``swing``: share by
-    which the exposure goes up and down, once in ``swing_s``. ``shadow``: share of light that a shadow takes; it is
-    ``shadow_px`` wide, its edges ``soft_px`` (sigma), and it crosses the picture once in ``shadow_s``. ``spot``: grey
-    levels of a lamp's reflection of radius ``spot_px`` (sigma), which circles about the middle once in ``spot_s``.
-    ``flicker``: share of light that comes and goes at ``flicker_hz``, seen as bands by rows that are read one after
-    another in ``readout_s``.
+    ``level``: factor of all light; 1 is the unmodified scene.
+    ``steps``: (s, level) times from which the ambient light has this level.
+    ``adapt_s``: time constant of an automatic exposure that follows the ambient light, 0: fixed exposure.
+    ``swing``: relative amplitude of an exposure oscillation of period ``swing_s``.
+    ``shadow``: share of light that a shadow blocks; ``shadow_px`` wide, edges of ``soft_px`` (sigma), crossing the
+    image
+    once in ``shadow_s``.
+    ``spot``: grey levels of a lamp's reflection of radius ``spot_px`` (sigma), which circles about the image centre
+    once in
+    ``spot_s``.
+    ``flicker``: share of light that varies at ``flicker_hz``, seen as bands since rows are read out one after another
+    in
+    ``readout_s``.
     """
 
     level: Positive = 1.0
@@ -50,7 +56,7 @@ class Lighting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     readout_s: Positive = 0.02
 
     def exposed(self, t_s: float) -> float:
-        """Light of the whole picture at ``t_s`` [s], with what the exposure makes of it."""
+        """Light of the whole image at ``t_s`` [s], exposure included."""
         gain, ambient = self.level, 1.0
         for at_s, level in sorted(self.steps):
             if at_s > t_s:
@@ -61,7 +67,7 @@ class Lighting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
         return float(gain * (1.0 + self.swing * np.sin(2.0 * np.pi * t_s / self.swing_s)))
 
     def lit(self, image: Picture, t_s: float) -> Picture:
-        """``image`` (h, w) [grey levels] in the light of ``t_s`` [s]."""
+        """``image`` (h, w) [grey levels] under the light at ``t_s`` [s]."""
         height, width = image.shape
         rows = np.full(height, self.exposed(t_s))
         if self.flicker:

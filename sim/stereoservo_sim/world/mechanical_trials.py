@@ -1,4 +1,4 @@
-"""Synthetic cells whose arms are not perfect: gravity loads, directions of approach, and trial data."""
+"""Synthetic cells with imperfect arms: gravity loads, directions of approach, and trial data."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from stereoservo_sim.world.synthetic import SyntheticCell
 
 
 def synthetic_load(cell: SyntheticCell, q: FloatArray) -> FloatArray:
-    """Loads (n,) of a synthetic arm at ``q`` (n,) as shares of what each joint would bear stretched out.
+    """Loads (n,) of a synthetic arm at ``q`` (n,) as shares of each joint's load with the arm stretched out.
 
-    Every link weighs the same, with its centre halfway to the next joint, under a base that stands upright: its z axis,
-    the first joint's, points up. A prismatic joint bears the share of its links' weight along its axis.
+    Every link has the same weight, with its centre halfway to the next joint, on an upright base: its z axis, the first
+    joint's, points up. A prismatic joint bears the component of its links' weight along its axis, as a share.
     """
     frames = cell.frames(q)
     origins, axes = frames[:, :3, 3], frames[:-1, :3, 2]
@@ -26,7 +26,7 @@ def synthetic_load(cell: SyntheticCell, q: FloatArray) -> FloatArray:
     centres, masses = 0.5 * (origins[:-1] + origins[1:]), np.ones(count)
     lengths = np.linalg.norm(np.diff(origins, axis=0), axis=1)
     ahead = np.cumsum(lengths)
-    # Of link k from joint j: what lies between them, and half of the link itself.
+    # Vector from joint j to the middle of link k.
     levers = np.triu(ahead[None, :] - 0.5 * lengths[None, :] - (ahead - lengths)[:, None])
     torques = gravity_torques(origins[:-1], axes, centres, masses, -up)
     slides = np.array([kind == "prismatic" for kind in cell.kinds])
@@ -35,8 +35,9 @@ def synthetic_load(cell: SyntheticCell, q: FloatArray) -> FloatArray:
 
 
 def approaches(positions: FloatArray, start: FloatArray) -> FloatArray:
-    """Directions (s, n), -1, 0 or 1, in which each joint last moved on its way from ``start`` (n,) through
-    ``positions`` (s, n); 0: not at all.
+    """Directions (s, n), -1, 0 or 1, in which each joint last moved on the path from ``start`` (n,) through
+    ``positions``
+    (s, n); 0: not moved.
     """
     steps = np.sign(np.diff(np.vstack([start, positions]), axis=0))
     for k in range(1, len(steps)):
@@ -60,7 +61,7 @@ def mechanical_trials(
     stops: int = 9,
     positions: tuple[FloatArray, IntArray] | None = None,
 ) -> TrialData:
-    """Trial data as of :meth:`SyntheticCell.trials`: positions that the encoders report, pixels of the links."""
+    """Trial data as of :meth:`SyntheticCell.trials`: positions reported by the encoders, pixels of the links."""
     motors, moved = cell.stops(stops) if positions is None else positions
     links, readings = links_and_readings(cell, mechanics, motors)
     seen = cell.trials(sigma, rng, positions=(links, moved))

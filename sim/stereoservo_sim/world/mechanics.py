@@ -1,15 +1,15 @@
 """Mechanics of real joints: gear ripple, play, sag, coupling, friction, drift, delay and coarse encoders.
 
-From the drive to the image an angle passes three places, all in joint units [rad or m]:
+From the drive to the image there are three angles, all in joint units [rad or m]:
 
-* motor: the drive's set-point, late by ``delay_s`` and ``lag_s``, less what Coulomb friction takes: ``dead_speed`` of a
-  drive that follows velocities, ``dead_band`` of one that follows positions;
+* motor: the drive's set-point, delayed by ``delay_s`` and ``lag_s``, minus the loss by Coulomb friction: ``dead_speed``
+  of a drive that follows velocities, ``dead_band`` of one that follows positions;
 * link: motor + ripple + play + sag + coupling. The images show the link;
-* reading: what the encoder reports, of the motor or of the link (``encoder_side``), with ``zero_drift``, in steps
-  of ``encoder_step``. An encoder on the motor sees none of the errors of the gear.
+* reading: reported by the encoder of the motor or of the link (``encoder_side``), with ``zero_drift``, in steps of
+  ``encoder_step``. An encoder on the motor sees none of the errors of the gear.
 
-Loads are gravity torques on the joints as shares of the largest that the arm can have, positive where they turn the
-joint in its positive direction. All arrays are (..., n), n joints, unless stated otherwise.
+Loads are gravity torques on the joints as shares of the arm's largest, positive if they turn the joint in its positive
+direction. All arrays are (..., n), n joints, unless stated otherwise.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ NonNegative = Annotated[float, Meta(ge=0)]
 Share = Annotated[float, Meta(ge=0, le=1)]
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
-"""In the world [m/s²]."""
+"""Gravity in the world [m/s²]."""
 FALL_SPEED = 0.5
-"""At which a link falls through its play, and a gear takes up a load [rad/s or m/s]."""
+"""Speed at which a link crosses its play, and a gear deflects under a load [rad/s or m/s]."""
 
 ARCMIN = float(np.deg2rad(1.0 / 60.0))
 
@@ -42,13 +42,13 @@ ARCMIN = float(np.deg2rad(1.0 / 60.0))
 class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Mechanics of one joint [rad, s; m for prismatic joints]; the default is perfect.
 
-    ``encoder_step``: its resolution at the joint, 0 where it is not modelled. ``encoder_side``: where it sits.
-    ``ripple``: amplitude, with ``ripple_order`` periods in a turn of the joint and ``ripple_phase`` at its zero.
-    ``play``: whole width between the flanks; a load above ``play_friction`` presses the link against the flank that
-    it pulls to, below it the link stays where the motor pushed it, on the flank behind the motion.
+    ``encoder_step``: its resolution at the joint, 0 if it is not modelled. ``encoder_side``: where it is mounted.
+    ``ripple``: amplitude, with ``ripple_order`` periods per turn of the joint and ``ripple_phase`` at its zero.
+    ``play``: whole width between the flanks. A load above ``play_friction`` presses the link against the flank in the
+    load's direction; below it the link stays where the motor pushed it, on the flank behind the motion.
     ``sag``: deflection under the largest gravity torque. ``coupling``: share of the previous joint's motor angle that
-    turns this joint too. ``dead_band``: whole width by which the set-point may move before friction yields.
-    ``dead_speed``: by which the motor is slower than its set-point, and below which it stands.
+    is added to this joint. ``dead_band``: whole width by which the set-point may move before friction yields.
+    ``dead_speed``: by which the motor is slower than its set-point, and below which it does not move.
     ``zero_drift`` [rad/h]: of the encoder's zero. ``lag_s``: time constant of the drive's loop; ``delay_s``: dead
     time of its commands.
     """
@@ -72,7 +72,7 @@ class Mechanics(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 PRESETS: dict[MechanicsPreset, Mechanics] = {
     # Makers' catalogues: accuracy of 0.5 to 1.5 arcmin, two periods a turn of the wave generator, ratios 50 to 160;
     # no play; spring constants of a size 20 gear that yield about 1 mrad at its first torque. Encoder of 16 bits on
-    # the motor: it sees nothing of the gear.
+    # the motor: it measures no error of the gear.
     "strain_wave": Mechanics(
         encoder_step=float(2.0 * np.pi / (65536 * 100)), ripple=0.5 * ARCMIN, ripple_order=200.0, sag=1e-3,
         dead_band=2e-5, lag_s=0.002,
@@ -91,18 +91,18 @@ PRESETS: dict[MechanicsPreset, Mechanics] = {
         sag=float(np.deg2rad(2.2)), dead_band=float(2.0 * np.pi / 4096), lag_s=0.02, delay_s=0.005,
     ),
 }  # fmt: skip
-"""By name. Phases of the ripple are those of :func:`preset`."""
+"""Presets by name. Phases of the ripple are set by :func:`preset`."""
 
 MechanicsOption = Literal["none", "strain_wave", "planetary_qdd", "serial_servo"] | dict[str, Mechanics]
-"""As in a cell file: a preset for all joints, or a table by joint; a joint that is left out is perfect."""
+"""Value in a cell file: a preset for all joints, or a table by joint; an omitted joint is perfect."""
 
 
 PINION = 0.02
-"""Travel of a prismatic joint of a preset to a turn of its gear by one radian [m]: a pinion of this radius."""
+"""Radius of the pinion [m]: travel of a preset's prismatic joint per radian of its gear."""
 
 
 def preset(name: MechanicsPreset, joints: int) -> tuple[Mechanics, ...]:
-    """Mechanics of all joints after a preset; ripple phases a golden angle apart, since gears are not aligned.
+    """Mechanics of all joints after a preset; ripple phases are a golden angle apart, since real gears are not aligned.
 
     Raises KeyError for an unknown name.
     """
@@ -114,7 +114,7 @@ def preset(name: MechanicsPreset, joints: int) -> tuple[Mechanics, ...]:
 
 
 def behind_pinion(joint: Mechanics) -> Mechanics:
-    """Mechanics [m] of a prismatic joint that a gear of mechanics ``joint`` [rad] drives by a pinion."""
+    """Mechanics [m] of a prismatic joint driven through a pinion by a gear of mechanics ``joint`` [rad]."""
     lengths = ("encoder_step", "ripple", "play", "sag", "dead_band", "dead_speed", "zero_drift")
     scaled = {name: getattr(joint, name) * PINION for name in lengths}
     return msgspec.structs.replace(joint, ripple_order=joint.ripple_order / PINION, **scaled)
@@ -123,10 +123,11 @@ def behind_pinion(joint: Mechanics) -> Mechanics:
 def chosen_mechanics(
     option: MechanicsOption, joint_names: Sequence[str], prismatic: Sequence[bool] = ()
 ) -> tuple[Mechanics, ...] | None:
-    """Mechanics of a cell file's joints, or None where there are none.
+    """Mechanics of a cell file's joints; None if none are stated.
 
-    ``prismatic``: of which joints a preset's gear drives a pinion; empty: of none. Raises ValueError for unknown
-    joints, and for a first joint that is coupled to a previous one.
+    ``prismatic``: joints that a preset's gear drives by a pinion; empty: none. Raises ValueError for unknown joints,
+    and
+    for a first joint that is coupled to a previous one.
     """
     if option == "none" or option == {}:
         return None
@@ -158,23 +159,23 @@ def ripple(motor: FloatArray, amplitude: FloatArray, order: FloatArray, phase: F
 
 
 def coupled(motor: FloatArray, coupling: FloatArray) -> FloatArray:
-    """What each joint turns by its coupling with the previous one's motor; the first joint's is 0."""
+    """Rotation (n,) of each joint by coupling with the previous joint's motor; 0 for the first joint."""
     turned = np.zeros_like(motor)
     turned[..., 1:] = coupling[1:] * motor[..., :-1]
     return turned
 
 
 def quantised(angle: FloatArray, step: FloatArray) -> FloatArray:
-    """``angle`` rounded to multiples of ``step``, at most half a step off; unchanged where the step is 0."""
+    """``angle`` rounded to multiples of ``step``, at most half a step off; unchanged if the step is 0."""
     fine = step <= 0.0
     unit = np.where(fine, 1.0, step)
     return np.where(fine, angle, np.round(angle / unit) * unit)
 
 
 def play_at_rest(play: FloatArray, load: FloatArray, friction: FloatArray, approach: FloatArray) -> FloatArray:
-    """Offset of the link in its play, at rest after a long way in the direction ``approach`` (its sign counts).
+    """Offset of the link in its play, at rest after a long move in the direction ``approach`` (its sign counts).
 
-    The load decides where it is above ``friction``; else the link lies behind the motion, and in the middle where
+    A load above ``friction`` determines the flank; else the link is on the flank behind the motion, or in the middle if
     there was none.
     """
     pressed = np.abs(load) > friction
@@ -196,7 +197,7 @@ def at_rest(
 
 
 def gear_offset(mechanics: Sequence[Mechanics], motor: FloatArray) -> FloatArray:
-    """Ripple and coupling at motor angles (..., n): what depends on nothing else."""
+    """Ripple and coupling at motor angles (..., n): the part of the offset that depends on these angles alone."""
     names = ("ripple", "ripple_order", "ripple_phase")
     return ripple(motor, *(column(mechanics, name) for name in names)) + coupled(motor, column(mechanics, "coupling"))
 
@@ -215,8 +216,8 @@ def gravity_torques(
     """Torques (n,) [N m] of gravity about revolute joints, positive about their axes; forces [N] along prismatic ones.
 
     ``points``, ``axes`` (n, 3): on and along each joint's axis. ``centres`` (n, 3) [m], ``masses`` (n,) [kg]: of the
-    link after each joint; joint i carries the links i, …, n - 1. ``gravity`` (3,) [m/s²]. ``prismatic`` (n,): which
-    joints are; None: none.
+    link after each joint; joint i carries the links i, …, n - 1. ``gravity`` (3,) [m/s²]. ``prismatic`` (n,): mask of
+    prismatic joints; None: all are revolute.
     """
     weights = masses[::-1].cumsum()[::-1]
     moments = (masses[:, None] * centres)[::-1].cumsum(axis=0)[::-1]
@@ -228,7 +229,7 @@ def gravity_torques(
 
 
 def gravity_load(robot: Robot, q: FloatArray) -> FloatArray:
-    """Loads (n,) of a robot at ``q`` (n,): gravity torques over a bound of what each joint can have to bear."""
+    """Loads (n,) of a robot at ``q`` (n,): gravity torques divided by each joint's `largest_torques`."""
     frames, _ = joint_frames(robot, q)
     centres = np.einsum("nij,nj->ni", frames[:, :3, :3], robot.centres) + frames[:, :3, 3]
     torques = gravity_torques(frames[:, :3, 3], frames[:, :3, 2], centres, robot.masses, prismatic=robot.prismatic)
@@ -237,7 +238,7 @@ def gravity_load(robot: Robot, q: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=8)
 def largest_torques(robot: Robot) -> FloatArray:
-    """Bounds (n,) of gravity torques [N m] with the arm stretched out; of forces [N] on prismatic joints."""
+    """Bounds (n,) of gravity torques [N m] with the arm stretched out; forces [N] for prismatic joints."""
     count = len(robot.joints)
     steps = np.linalg.norm(robot.links[:, :3, 3], axis=1)
     steps = steps + [
@@ -256,19 +257,19 @@ def largest_torques(robot: Robot) -> FloatArray:
 
 
 def horizontal_load(q: FloatArray) -> FloatArray:
-    """Loads (n,) of joints whose arm is not known: each hangs at its zero's height, ``-cos q``."""
+    """Loads (n,) of joints of an unknown arm, which is level at each joint's zero: ``-cos q``."""
     found: FloatArray = -np.cos(q)
     return found
 
 
-# -- what has a memory ----------------------------------------------------------------------------------------
+# -- mechanics with memory -------------------------------------------------------------------------------------
 
 
 class Transmission:
-    """From set-points of the drives to link angles and readings, step by step. Positions (n,) [rad or m].
+    """Computes link angles and readings from set-points of the drives, step by step. Positions (n,) [rad or m].
 
     ``motor``, ``link``: true angles. ``load``: function of the motor angles (n,) that returns the loads (n,).
-    Starts at rest with the links at ``link``, pressed by their load against their flanks, else midway in the play.
+    Starts at rest with the links at ``link``, pressed by their load against a flank, else in the middle of the play.
     """
 
     def __init__(
@@ -286,7 +287,7 @@ class Transmission:
         self._on_joint = np.array([joint.encoder_side == "joint" for joint in mechanics])
         self._t = 0.0
         self.motor = link.copy()
-        for _ in range(20):  # the offset hardly depends on the angle: each round gains two digits and more
+        for _ in range(20):  # the offset hardly depends on the angle: each iteration adds two digits or more
             self._settle()
             self.motor = self.motor + (link - self.link)
         self._settle()
@@ -297,7 +298,7 @@ class Transmission:
         self._resting = True
 
     def _settle(self) -> None:
-        """Rest under the load at ``motor``."""
+        """Settle at rest under the load at ``motor``."""
         load = self._load(self.motor)
         self._play = play_at_rest(self._play_width, load, self._friction, np.zeros_like(load))
         self._sagged = self._sag * load
@@ -308,12 +309,12 @@ class Transmission:
 
     @property
     def readings(self) -> FloatArray:
-        """Angles at the encoders (n,), with drift, before they are rounded to steps."""
+        """Angles at the encoders (n,), with drift, before quantisation."""
         return np.where(self._on_joint, self.link, self.motor) + self._drift * self._t
 
     @property
     def reading_offset(self) -> FloatArray:
-        """Readings less link angles (n,)."""
+        """Readings minus link angles (n,)."""
         return self.readings - self.link
 
     def follow(self, set_positions: FloatArray, h: float) -> None:
@@ -322,7 +323,7 @@ class Transmission:
         arrived = self._delay.after(self._driven(set_positions, h), h)
         share = np.where(self._lag > 0.0, -np.expm1(-h / np.maximum(self._lag, 1e-12)), 1.0)
         step = arrived - self._lagged
-        # An exponential never ends: what is left of it within a nanometre is done at once.
+        # An exponential never ends: a remainder below a nanometre is completed at once.
         self._lagged = np.where(np.abs(step) < 1e-9, arrived, self._lagged + share * step)
         motor = np.clip(self.motor, self._lagged - self._half_band, self._lagged + self._half_band)
         moved = motor - self.motor
@@ -340,7 +341,7 @@ class Transmission:
         self._resting = bool(settled and (self.link == before).all())
 
     def _driven(self, set_positions: FloatArray, h: float) -> FloatArray:
-        """Set-points (n,) less all that friction has kept back of their motion."""
+        """Set-points (n,) minus the accumulated motion lost to friction."""
         step = set_positions - self._set
         self._set = set_positions.copy()
         most = self._dead_speed * h
@@ -348,14 +349,14 @@ class Transmission:
         return set_positions - self._held_back
 
     def rest(self, h: float) -> bool:
-        """Let ``h`` [s] pass where nothing moves or is about to; whether that is so."""
+        """Let ``h`` [s] pass if nothing moves or is about to; returns whether that is so."""
         if self._resting:
             self._t += h
         return self._resting
 
 
 class _Delay:
-    """Dead time of set-points, one for each joint (n,) [s], linear between them."""
+    """Dead time of set-points, one for each joint (n,) [s]; linear interpolation."""
 
     def __init__(self, delay_s: FloatArray, positions: FloatArray) -> None:
         self._delay = delay_s
@@ -364,7 +365,7 @@ class _Delay:
         self._t = 0.0
 
     def after(self, positions: FloatArray, h: float) -> FloatArray:
-        """Set-points (n,) that arrive ``h`` [s] after the last call, at which ``positions`` (n,) were sent."""
+        """Set-points (n,) that take effect ``h`` [s] after the last call, at which ``positions`` (n,) were sent."""
         if self._longest == 0.0:
             return positions
         self._t += h
@@ -377,13 +378,13 @@ class _Delay:
 
 
 # -- a plant behind them -------------------------------------------------------------------------------------
-# A plant behind imperfect mechanics: its drives' set-points reach the links through gears, encoders see one side.
+# A plant with imperfect mechanics: the drives' set-points reach the links through gears; encoders are on one side.
 
 
 class MechanicalPlant:
-    """``links`` moved through ``mechanics``, a joint each; otherwise as :class:`velocity_drives.Plant`.
+    """``links`` moved through ``mechanics``, one per joint; otherwise as :class:`velocity_drives.Plant`.
 
-    ``robot``: whose weight the joints bear; None: each joint bears an arm that is level at its zero.
+    ``robot``: whose weight loads the joints; None: the load of an arm that is level at each joint's zero.
     """
 
     def __init__(self, links: Plant, mechanics: Sequence[Mechanics], robot: Robot | None) -> None:
@@ -394,7 +395,7 @@ class MechanicalPlant:
 
     @property
     def positions(self) -> FloatArray:
-        """Links (n,): the truth."""
+        """True positions (n,) of the links."""
         return self.links.positions
 
     @property
@@ -404,7 +405,7 @@ class MechanicalPlant:
 
     @property
     def efforts(self) -> FloatArray:
-        """Efforts (n,) of what moves the links."""
+        """Efforts (n,) that move the links."""
         return self.links.efforts
 
     @property
@@ -414,7 +415,7 @@ class MechanicalPlant:
 
     @property
     def readings(self) -> FloatArray:
-        """Angles at the encoders (n,), before they are rounded to steps."""
+        """Angles at the encoders (n,), before quantisation."""
         return self.links.positions + self.transmission.reading_offset
 
     @property
@@ -431,7 +432,7 @@ class MechanicalPlant:
         self.links.follow(gear.link, (gear.link - link) / h, h)
 
     def rest(self, h: float) -> bool:
-        """Let ``h`` [s] pass if nothing moves or is about to; whether that is so."""
+        """Let ``h`` [s] pass if nothing moves or is about to; returns whether that is so."""
         return self.links.rest(h) and self.transmission.rest(h)
 
     def close(self) -> None:

@@ -25,12 +25,12 @@ POSITION_GAIN = 0.2
 
 
 class PhysicsError(Exception):
-    """pybullet cannot be used; the message holds the cause."""
+    """pybullet cannot be used; the message states the cause."""
 
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Without what C code prints."""
+    """Suppress the output of C code."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(descriptor) for descriptor in (1, 2)]
@@ -39,7 +39,7 @@ def _quiet() -> Iterator[None]:
             os.dup2(sink.fileno(), 1)
             os.dup2(sink.fileno(), 2)
             yield
-            ctypes.CDLL(None).fflush(None)  # what sits in C's own buffers
+            ctypes.CDLL(None).fflush(None)  # C's own buffers
     finally:
         for descriptor, copy in zip((1, 2), kept, strict=True):
             os.dup2(copy, descriptor)
@@ -60,8 +60,9 @@ def import_pybullet() -> Any:
 
 @dataclass(frozen=True)
 class LoadedRobot:
-    """An arm in a simulation: its body's number there, the indices of its joints, and of the link of the flange;
-    ``beside``: joints that are not the arm's, with the positions where they rest; ``moving``: all joints that move.
+    """An arm in a simulation: the id of its body, the indices of its joints, and of the link of the flange.
+
+    ``beside``: joints outside the arm, with their rest positions; ``moving``: all joints that move.
     """
 
     body: int
@@ -72,7 +73,7 @@ class LoadedRobot:
 
 
 def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
-    """Load an arm into a simulation, the joints beside it at rest. Raises PhysicsError where the engine cannot."""
+    """Load an arm into a simulation, the joints beside it at rest. Raises PhysicsError if the engine cannot."""
     with tempfile.TemporaryDirectory() as folder, _quiet():
         path = robot.file or Path(folder) / f"{robot.name}.urdf"
         if robot.file is None:
@@ -154,7 +155,7 @@ class PybulletPlant(RigidPlant):
         self._bullet.setGravity(*gravity.tolist(), physicsClientId=self._client)
 
     def place(self, positions: FloatArray) -> None:
-        """Set the joints to ``positions`` (n,), at rest, without moving there."""
+        """Set the joints to ``positions`` (n,), at rest, without motion."""
         for joint, position in zip(self._joints, positions.tolist(), strict=True):
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
@@ -163,7 +164,7 @@ class PybulletPlant(RigidPlant):
         for place, position in zip(self._places, positions.tolist(), strict=True):
             rests[place] = position
         still = [0.0] * len(rests)
-        self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's axes for the world's
+        self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's frame as the world's
         balanced = self._bullet.calculateInverseDynamics(self._arm, rests, still, still, physicsClientId=self._client)
         self._pull(GRAVITY)
         self.efforts = np.array(balanced)[self._places]
@@ -188,7 +189,7 @@ class PybulletPlant(RigidPlant):
         self.efforts = np.array([state[3] for state in states])
 
     def flange(self) -> FloatArray:
-        """Pose (4, 4) of the flange as the engine sees it, for checks against the closed form."""
+        """Pose (4, 4) of the flange as computed by the engine, for checks against the closed form."""
         state = self._bullet.getLinkState(
             self._arm, self._loaded.flange, computeForwardKinematics=True, physicsClientId=self._client
         )

@@ -1,4 +1,4 @@
-"""Names of the mechanics presets, for commands that offer them before they import anything heavier."""
+"""Names of the mechanics presets, separate so that commands can offer them without heavy imports."""
 
 from __future__ import annotations
 

@@ -5,13 +5,13 @@ within 10 % of each other), principal points off by up to 30 px, roll up to 10°
 of arms in random configurations; four bodies, two of them flat, 0.6 to 2 m away, tilted by up to 40°; noise 0.01 to
 1 px (log-uniform), 9 to 15 stops a joint.
 
-What is drawn again: rigs that do not both see the whole body at home, and configurations in which some joint cannot
-move by ``MIN_RANGE`` with ``MIN_SHOWN`` markers in both images. An operator would choose another home, too. Nothing
-else is: no case is drawn again because its fit is hard.
+What is redrawn: rigs that do not both see the whole body at home, and configurations in which some joint cannot
+move by ``MIN_RANGE`` with ``MIN_SHOWN`` markers in both images; an operator would choose another home, too. No case is
+redrawn because its fit is hard.
 
-Cases behind lenses are the same rigs, whose cameras share a make of lens: radial terms of OpenCV's model up to what
-wide lenses have, tangential ones, a centre at the principal point. Lenses that would fold an image back are drawn
-again: such are not made.
+Cases with lens distortion use the same rigs, whose cameras have lenses of one type: radial terms of OpenCV's model up
+to those of wide lenses, tangential ones, a centre at the principal point. Lenses that would fold the image are
+redrawn, since they are not manufactured.
 """
 
 from __future__ import annotations
@@ -40,51 +40,49 @@ from stereoservo_sim.world.synthetic import (
 Row = tuple[float, float, float]
 
 BASELINES = (0.08, 0.5)
-"""[m]"""
+"""Range of the baseline [m]."""
 VERGENCES = (0.0, 60.0)
-"""Angle between the optical axes [°]."""
+"""Range of the angle between the optical axes [°]."""
 FOCALS = (450.0, 1600.0)
-"""[px], 640 px wide images."""
+"""Range of focal lengths [px], 640 px wide images."""
 FOCAL_RATIO = 0.1
-"""How far the right camera's focal length may differ from the left one's."""
+"""Largest relative difference of the right camera's focal length from the left one's."""
 PRINCIPAL_OFFSET = 30.0
-"""[px]"""
+"""Largest offset of the principal point [px]."""
 ROLL = 10.0
-"""About the optical axes, between the cameras [°]."""
+"""Largest roll about the optical axes, between the cameras [°]."""
 DISTANCES = (0.6, 2.0)
-"""From the rig to the body [m]."""
+"""Range of the distance from the rig to the body [m]."""
 TILT = 40.0
 """Largest angle of the body against the rig's axis [°]."""
 NOISES = (0.01, 1.0)
-"""[px], log-uniform."""
+"""Range of the noise [px], log-uniform."""
 STOPS = (9, 15)
-"""A joint."""
+"""Range of the number of stops per joint."""
 MAX_RANGE = 0.6
-"""Widest motion of a joint to either side [rad]."""
+"""Largest motion of a joint to either side [rad]."""
 MIN_RANGE = 0.05
-"""A home at which some joint may move less than this to either side [rad] is drawn again."""
+"""A home at which some joint may move less than this to either side [rad] is redrawn."""
 MIN_SHOWN = 4
-"""Markers that both images hold at every stop."""
+"""Least number of markers that both images show at every stop."""
 K1, K2 = (-0.4, 0.1), (-0.05, 0.2)
-"""Radial terms of the lenses, OpenCV's."""
+"""Ranges of the radial terms of the lenses, OpenCV's."""
 TANGENTIAL = 1e-3
 """Largest tangential term of each lens, OpenCV's."""
 LENS_RATIO = 0.1
-"""How far the radial terms of the second camera's lens may differ from the first one's."""
+"""Largest relative difference of the radial terms of the second camera's lens from the first one's."""
 UNFOLDED = 1.1
-"""Ideal radius at which lenses fold back at least, over that of the image's corner."""
+"""Least ideal radius at which lenses fold, as a multiple of the radius of the image's corner."""
 MARGIN = 4.0
-"""Distance of markers from the edge of the image [px]."""
+"""Least distance of markers from the edge of the image [px]."""
 
 UR_ROWS: tuple[Row, ...] = ((0, 90, 0.15), (-0.42, 0, 0), (-0.39, 0, 0), (0, 90, 0.13), (0, -90, 0.1), (0, 0, 0.08))
-"""Three parallel axes and a wrist whose axes do not meet, rows (a [m], alpha [°], d [m])."""
+"""Three parallel axes and a wrist whose axes do not intersect, rows (a [m], alpha [°], d [m])."""
 
 
 @dataclass(frozen=True, eq=False)
 class RandomCase:
-    """A random cell with its noise [px], number of stops a joint, and parameters; ``redraws``: homes and rigs
-    rejected.
-    """
+    """A random cell with its noise [px], number of stops a joint, and parameters; ``redraws``: rejected homes, rigs."""
 
     seed: int
     cell: SyntheticCell
@@ -95,7 +93,7 @@ class RandomCase:
     redraws: int
 
     def trials(self) -> TrialData:
-        """Trial data, reproducible; markers out of an image are missing."""
+        """Trial data, reproducible; markers outside an image are missing."""
         rng = np.random.default_rng([self.seed, 1])
         return hidden_out_of_view(self.cell, self.cell.trials(self.sigma, rng, self.stops))
 
@@ -103,14 +101,14 @@ class RandomCase:
         """Configurations (count, n) inside the ranges with a marker in both images."""
         rng = np.random.default_rng([self.seed, 2])
         drawn = self.cell.held_out(rng, 20 * count)
-        # A pose counts while it has a marker in both images; home always does.
+        # A pose counts if it has a marker in both images; home always does.
         seen = self.cell.in_view(drawn).all(axis=0).any(axis=1)
         kept = drawn[seen][:count]
         return kept if len(kept) else self.cell.home[None]
 
 
 def hidden_out_of_view(cell: SyntheticCell, trials: TrialData) -> TrialData:
-    """The trials with NaN where the cell's exact pixels lie outside an image."""
+    """The trials with NaN for exact pixels outside an image."""
     seen = cell.in_view(trials.positions)
     return msgspec.structs.replace(trials, pixels=np.where(seen[..., None], trials.pixels, np.nan))
 
@@ -131,7 +129,7 @@ def random_case(seed: int) -> RandomCase:
 
 
 def random_lens_case(seed: int) -> RandomCase:
-    """Random cell of ``seed`` with lenses that distort, reproducible bit for bit."""
+    """Random cell of ``seed`` with lens distortion, reproducible bit for bit."""
     case = random_case(seed)
     rng = np.random.default_rng([seed, 3])
     return replace(case, cell=replace(case.cell, lenses=random_lenses(rng, case.cell)))
@@ -152,7 +150,7 @@ def random_lenses(rng: np.random.Generator, cell: SyntheticCell) -> FloatArray:
 
 
 def unfolded(lens: FloatArray, width: int, height: int) -> bool:
-    """Whether a lens folds back well outside of its image."""
+    """Whether a lens folds only well outside its image."""
     corners = np.array([[u, v] for u in (0.0, width - 1.0) for v in (0.0, height - 1.0)])
     reach = np.linalg.norm(undistort(lens, corners) - lens[1:3], axis=1).max()
     return bool(UNFOLDED * reach < fold_radius(lens))
@@ -176,8 +174,8 @@ def random_pair(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
 
 
 def visible_ranges(cell: SyntheticCell) -> FloatArray:
-    """Widest motion (n,) [rad or m] to either side of home, up to ``MAX_RANGE``, with ``MIN_SHOWN`` markers in
-    both images, as the trial programme would find it.
+    """Largest motion (n,) [rad or m] to either side of home, up to ``MAX_RANGE``, with ``MIN_SHOWN`` markers in both
+    images, as the calibration motion would find it.
     """
     steps = np.linspace(0.0, MAX_RANGE, 61)
     n = len(cell.home)
@@ -194,7 +192,7 @@ def visible_ranges(cell: SyntheticCell) -> FloatArray:
 
 
 def _drawn(rng: np.random.Generator, arm: str, body: FloatArray) -> SyntheticCell | None:
-    """A random cell, or None where the body is not visible or some joint can move too little."""
+    """A random cell, or None if the body is not visible or some joint can move too little."""
     rows, home = ARMS[arm](rng)
     intrinsics, poses = random_pair(rng)
     tilt_axis = rng.uniform(0.0, 360.0)
@@ -220,7 +218,7 @@ def _drawn(rng: np.random.Generator, arm: str, body: FloatArray) -> SyntheticCel
 def _posed(
     rows: tuple[Row, ...], home_deg: tuple[float, ...]
 ) -> Callable[[np.random.Generator], tuple[tuple[Row, ...], FloatArray]]:
-    """A known arm within 30° of a home."""
+    """A known arm at a random configuration within 30° of a home."""
 
     def draw(rng: np.random.Generator) -> tuple[tuple[Row, ...], FloatArray]:
         return rows, np.radians(np.array(home_deg) + rng.uniform(-30, 30, len(rows)))
@@ -229,21 +227,21 @@ def _posed(
 
 
 def _random_arm(rng: np.random.Generator) -> tuple[tuple[Row, ...], FloatArray]:
-    """Six rows: twists of 0, ±90° or anything, lengths up to 0.4 m, in any configuration."""
+    """Random arm of six rows: twists of 0, ±90° or arbitrary, lengths up to 0.4 m, in a random configuration."""
     rows = []
     for _ in range(6):
         twist = float(rng.choice([0.0, 90.0, -90.0, rng.uniform(-180, 180)]))
         length = float(rng.choice([0.0, rng.uniform(-0.4, 0.4)]))
         rows.append((length, twist, float(rng.choice([0.0, rng.uniform(-0.4, 0.4)]))))
-    # The tool stands off the last axis's origin; the body's own offset does that for the others.
+    # The tool is offset from the last axis's origin; the body's own offset does that for the others.
     return tuple(rows), rng.uniform(-np.pi, np.pi, 6)
 
 
 def cube_corner() -> FloatArray:
-    """12 dots (12, 3), four on each of three faces that meet at the tip of a corner, 9 cm an edge [m]."""
+    """12 dots (12, 3), four on each of three faces that meet at the tip of a corner, edges of 9 cm [m]."""
     square = np.array([(25, 25), (75, 30), (70, 80), (28, 70)]) / 1000
     corner = np.vstack([np.insert(square, axis, 0.0, axis=1) for axis in range(3)])
-    # The edges fall away from the tip, which looks along the flange's z.
+    # The edges fall away from the tip, which points along the flange's z.
     z = -np.ones(3) / np.sqrt(3.0)
     x = np.cross([1.0, 0.0, 0.0], z)
     x /= np.linalg.norm(x)
@@ -261,7 +259,7 @@ ARMS: dict[str, Callable[[np.random.Generator], tuple[tuple[Row, ...], FloatArra
     "ur": _posed(UR_ROWS, (10, -70, 90, -80, -70, 15)),
     "random": _random_arm,
 }
-"""Rows and home of each family, one drawn with equal probability."""
+"""Rows and home of each family, drawn with equal probability."""
 BODIES: dict[str, Callable[[], FloatArray]] = {
     "two_faces": two_faces,
     "corner": cube_corner,
@@ -270,4 +268,4 @@ BODIES: dict[str, Callable[[], FloatArray]] = {
 }
 """Markers of each body: 14, 12, 4 and 7."""
 SHARES = (0.35, 0.35, 0.15, 0.15)
-"""How often each body is drawn."""
+"""Probability of each body."""

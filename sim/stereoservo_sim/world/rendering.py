@@ -1,9 +1,9 @@
 """Renderer of simulated camera images: background, arm, marker body, lens blur, sensor noise.
 
-The marker body is drawn by area coverage: spans of every dot and plate are found exactly on sixteen lines
-a pixel row, so that centroids are true to a few thousandths of a pixel. (A rasteriser's images are biased
-by up to half a pixel, and even antialiased ones by hundredths.) Behind a lens that bends, a dot is the exact image of
-its rim, so that it is also off its centre's image as a real one is; what stands behind the body is bent as a picture.
+The marker body is drawn by area coverage: spans of every dot and plate are found exactly on sixteen lines per pixel
+row, so that centroids are exact to a few thousandths of a pixel. (A rasteriser's images are biased by up to half a
+pixel, and even antialiased ones by hundredths.) With lens distortion a dot is the exact image of its rim, so that, as
+with a real one, its centroid differs from the image of its centre; what is behind the body is distorted as an image.
 """
 
 from __future__ import annotations
@@ -29,20 +29,21 @@ DOT_LEVEL = 225.0
 PLATE_LEVEL = 24.0
 BACK_LEVEL = 70.0
 BAND = 16
-"""Rows of a rolling shutter that are exposed at one time."""
+"""Rows of a rolling shutter that are exposed at the same time."""
 _NOISE_MARGIN = 64
 Region = tuple[int, int, int, int]
-"""Left, top, right, bottom [px]; right and bottom are the first beyond."""
+"""Left, top, right, bottom [px]; right and bottom are exclusive."""
 Link = tuple[FloatArray, float, float]
-"""A link's outline (k, 2) [px], its grey level, and how near it comes [m]."""
+"""A link's outline (k, 2) [px], its grey level, and its least depth [m]."""
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
+    """Settings of the renderer.
 
-    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm anew for
-    every frame; ``plain`` is an even grey. ``lighting``: how light changes; None: it does not.
+    ``blur_px``: sigma of the lens blur; ``noise_grey``: sigma of the sensor noise [grey levels].
+    ``background``: ``pybullet`` is its rendered arm, refreshed now and then; ``arm`` draws a room and the arm again for
+    every frame; ``plain`` is a uniform grey. ``lighting``: variation of light; None: constant.
     """
 
     blur_px: float = 0.7
@@ -52,9 +53,9 @@ class RenderSettings:
 
 
 class Renderer:
-    """Renders the simulated cell in one camera of its rig. Caches the background and a field of noise.
+    """Renders the simulated cell in one camera of its rig. Caches the background and a noise field.
 
-    Raises ValueError where the camera's lens leaves the image's corners dark.
+    Raises ValueError if the camera's lens leaves the image's corners dark.
     """
 
     def __init__(self, cell: SimulatedCell, camera: PinholeCamera, settings: RenderSettings) -> None:
@@ -79,10 +80,13 @@ class Renderer:
     ) -> ImageArray:
         """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
 
-        ``workpiece`` (4, 4): where it stands in the world; default: where it stood at first. Links that are nearer
-        than the workpiece are drawn over it where they are nearer than the body, too. ``focus``: focal length of what
-        is drawn of the body over the camera's. ``at_row``: where the arm is when a row is exposed, in bands of
-        ``BAND`` rows, in place of ``q``. ``t_s``: since when the light changes.
+        ``workpiece`` (4, 4): its pose in the world; default: its initial pose. Links nearer than the workpiece are
+        drawn over
+        it if they are nearer than the body, too. ``focus``: focal length for drawing the body as a multiple of the
+        camera's.
+        ``at_row``: arm position at a row's exposure, in bands of ``BAND`` rows, used in place of ``q``. ``t_s``: time
+        since the
+        start of the light variation.
         """
         camera = self.camera.focused(focus)
         if at_row is None:
@@ -100,7 +104,7 @@ class Renderer:
             background = background.copy()
             front = self._draw_arm(background, q)
         elif self.settings.background == "pybullet":
-            front = self._draw_arm(background.copy(), q)  # only what stands before the body is drawn again
+            front = self._draw_arm(background.copy(), q)  # only parts in front of the body are drawn again
         image = self._bending.image(background).astype(np.float32)
         for region in self._draw_markers(image, q, front, workpiece, camera):
             if self.settings.blur_px > 0:
@@ -115,7 +119,10 @@ class Renderer:
         workpiece: FloatArray | None,
         camera: PinholeCamera,
     ) -> list[Region]:
-        """Body, workpiece and the links in ``front`` of the body, far ones first; the regions touched, none twice."""
+        """Draw the body, the workpiece and the links in ``front`` of the body, far ones first; returns the disjoint
+        regions
+        touched.
+        """
         layers: list[Callable[[], Region | None]] = [
             lambda: draw_body(image, self.cell, camera, q),
             *(partial(self._draw_link, image, outline, level) for outline, level, _ in front),
@@ -181,7 +188,7 @@ def _backdrop(cell: SimulatedCell, pinhole: PinholeCamera, background: str) -> B
 def draw_body(
     image: npt.NDArray[np.float32], cell: SimulatedCell, camera: PinholeCamera, q: FloatArray
 ) -> Region | None:
-    """Draw the marker body of ``cell`` with the arm at ``q`` (n,), as :func:`draw_faces` does."""
+    """Draw the marker body of ``cell`` with the arm at ``q`` (n,), by :func:`draw_faces`."""
     return draw_faces(image, cell.body, cell.body_pose(q), cell.in_world(camera, q))
 
 
@@ -190,11 +197,12 @@ def draw_faces(
 ) -> Region | None:
     """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
 
-    Of a solid the faces that look at the camera, shaded by its light. Else faces turned away show their dull backs and
-    are drawn first: the body is convex, so no face that looks at the camera is hidden by another.
+    Of a solid the faces turned to the camera, shaded by its light. Otherwise faces turned away show their dull backs
+    and
+    are drawn first: the body is convex, so no face turned to the camera is hidden by another.
 
     Returns:
-        The region touched (left, top, right, bottom) [px], or None where nothing was drawn.
+        The region touched (left, top, right, bottom) [px], or None if nothing was drawn.
     """
     if isinstance(body, SolidBody):
         return _draw_solid(image, body, body_pose, camera)
@@ -208,7 +216,7 @@ def draw_faces(
     for cosine, face, H in sorted(faces, key=lambda item: item[0] > 0):
         s = face.half_side
         corners = np.array([[-s, -s, 1], [s, -s, 1], [s, s, 1], [-s, s, 1.0]]) @ H.T
-        if corners[:, 2].min() < 0.05:  # at the camera: nothing sensible to draw
+        if corners[:, 2].min() < 0.05:  # at the camera: cannot be drawn
             continue
         outline = corners[:, :2] / corners[:, 2:]
         if camera.k1 != 0.0:
@@ -225,7 +233,7 @@ def draw_faces(
 def _draw_solid(
     image: npt.NDArray[np.float32], body: SolidBody, pose: FloatArray, camera: PinholeCamera
 ) -> Region | None:
-    """Draw a convex solid by the coverage of its faces, so that no background shines through where two meet."""
+    """Draw a convex solid by the coverage of its faces, so that no background shows where two faces meet."""
     placed = body.vertices @ pose[:3, :3].T + pose[:3, 3]
     pixels, depths = project(camera.P, placed)
     if depths.min() < 0.05:
@@ -266,7 +274,7 @@ def _draw_dot(
         return
     rim = (centre + radius * unit_circle()) @ H[:, :2].T + H[:, 2]
     outline = distort(camera.lens, rim[:, :2] / rim[:, 2:])
-    if np.isfinite(outline).all():  # else the lens does not show it
+    if np.isfinite(outline).all():  # otherwise the lens does not image it
         blend_polygon(image, outline, level)
 
 
@@ -290,7 +298,7 @@ def _region(boxes: list[tuple[FloatArray, FloatArray]], camera: PinholeCamera) -
 
 
 def _apart(regions: list[Region]) -> list[Region]:
-    """Disjoint regions: overlapping ones are replaced by the one around both, so that nothing is blurred twice."""
+    """Disjoint regions: overlapping ones are replaced by their common bounding box, so nothing is blurred twice."""
     if len(regions) == 2:
         (l0, t0, r0, b0), (l1, t1, r1, b1) = regions
         if l0 < r1 and l1 < r0 and t0 < b1 and t1 < b0:
@@ -317,11 +325,11 @@ def _capsule_outline(centres: FloatArray, sizes: FloatArray) -> FloatArray:
 
 
 CIRCLE_POINTS = 40
-"""Corners of the polygon that represents a dot: with its area, the centre of its image is right to 1e-4 px."""
+"""Corners of the polygon that represents a dot: with equal area, the centre of its image is correct to 1e-4 px."""
 PIECE_PX = 20.0
-"""Length up to which a piece of an outline's edge stays straight."""
+"""Largest length of a straight piece of an outline's edge."""
 MOST_PIECES = 64
-"""Of one edge, which may reach far out of the picture."""
+"""Largest number of pieces of one edge, which may extend far outside the image."""
 
 
 def unit_circle() -> FloatArray:
@@ -333,9 +341,10 @@ def unit_circle() -> FloatArray:
 
 
 def bend_outline(camera: PinholeCamera, outline: FloatArray) -> FloatArray:
-    """A polygon (k, 2) in ideal pixels, distorted by the lens of ``camera``, its edges finely divided.
+    """A polygon (k, 2) in ideal pixels, distorted by the lens of ``camera``, its edges finely subdivided.
 
-    Corners beyond the lens's fold stay at the rim of what it images: outside of the picture, whose corners it reaches.
+    Corners beyond the fold of the distortion are moved to the rim of the lens's image, which is outside the camera's
+    image.
     """
     ways = np.roll(outline, -1, axis=0) - outline
     pieces = np.clip(np.ceil(np.linalg.norm(ways, axis=1) / PIECE_PX), 1, MOST_PIECES).astype(int)
@@ -354,7 +363,7 @@ class BentImage:
     """Distorts the image of ``pinhole``, a larger one without distortion at the same pose, into a camera's image."""
 
     def __init__(self, camera: PinholeCamera) -> None:
-        """Raises ValueError where the lens's image ends inside the image."""
+        """Raises ValueError if the distorted image ends inside the image."""
         if not camera.sees_whole_image:
             raise ValueError(f"camera {camera.name!r}: k1 = {camera.k1:g} leaves the image's corners dark")
         self.camera = camera
@@ -393,12 +402,12 @@ class BentImage:
 
 
 REFRESH_FRAMES = 15
-REFRESH_MOVE = 0.05  # [rad] that some joint must have moved
+REFRESH_MOVE = 0.05  # [rad], least motion of some joint
 PLAIN_LEVEL = 90
 
 
 class Backdrop:
-    """Background images that are too slow for every frame: cached until the arm has moved and time has passed."""
+    """Background images too slow for every frame: cached until the arm has moved and some frames have passed."""
 
     def __init__(self) -> None:
         self._age = 0
@@ -419,7 +428,7 @@ class Backdrop:
 
 
 class RoomBackdrop(Backdrop):
-    """A wall and a floor, dimmer than the dots and unevenly lit, as a pinhole ``camera`` of the rig sees them."""
+    """A wall and a floor, dimmer than the dots and unevenly lit, as seen by a pinhole ``camera`` of the rig."""
 
     def __init__(self, cell: SimulatedCell, camera: PinholeCamera) -> None:
         super().__init__()
@@ -460,9 +469,9 @@ class PlainBackdrop(Backdrop):
         return self._image
 
 
-SHRINK = 2  # rendered at half size and enlarged: a quarter of the cost, and the lens would blur it anyway
+SHRINK = 2  # rendered at half size and enlarged: a quarter of the cost, and the lens blurs it in any case
 NEAR, FAR = 0.05, 8.0  # clipping planes [m]
-BRIGHTNESS = 0.6  # of what pybullet's lamp gives
+BRIGHTNESS = 0.6  # factor on pybullet's lamp
 
 
 class PybulletBackdrop(Backdrop):
@@ -513,7 +522,7 @@ class PybulletBackdrop(Backdrop):
 
 
 def projection_matrix(camera: PinholeCamera) -> FloatArray:
-    """OpenGL projection (4, 4) of a pinhole whose pixels are centred on integers."""
+    """OpenGL projection (4, 4) of a pinhole with pixels centred on integers."""
     (fx, _, cx), (_, fy, cy) = camera.K[0], camera.K[1]
     return np.array(
         [

@@ -1,6 +1,6 @@
-"""Serial arms: forward kinematics, shapes, and URDF text; one of Denavit-Hartenberg rows.
+"""Serial arms: forward kinematics, shapes, and URDF text; an arm from Denavit-Hartenberg rows.
 
-This is the simulation's truth. Nothing of it reaches the service, which learns the arm from images.
+This is the simulation's ground truth. The service never sees it; it learns the arm from images.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import JointSpec
 
 NO_EXTENT = 0.02
-"""Radius [m] of what a link without shapes is taken for where its inertia is asked for."""
+"""Radius [m] assumed for the inertia of a link without shapes."""
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,15 @@ class Capsule:
 
 @dataclass(frozen=True, eq=False)
 class Robot:
-    """A serial arm of ``n`` joints, each about or along the z axis of its frame; ``joints`` the machine's limits.
+    """A serial arm of ``n`` joints, each about or along the z axis of its frame.
 
-    ``base`` (4, 4): the first joint's frame in the world at its zero. ``links`` (n, 4, 4): from each joint's frame,
-    moved, to the next one's at its zero, the last to the flange. ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the
-    links in their joints' frames. Shapes of link 0 are in the world. ``file``: the URDF that it was read from, mounted
-    at ``mounted`` (4, 4) in the world, with the flange at its link ``flange``; ``notes``: what of it is left out.
+    ``joints``: the machine's limits.
+    ``base`` (4, 4): the first joint's frame in the world at its zero.
+    ``links`` (n, 4, 4): from each joint's frame, moved, to the next one's at its zero, the last to the flange.
+    ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the links in their joints' frames.
+    ``shapes``: those of link 0 are in the world.
+    ``file``: the URDF that it was read from, mounted at ``mounted`` (4, 4) in the world, with the flange at its link
+    ``flange``; ``notes``: what is omitted of it.
     """
 
     name: str
@@ -67,8 +70,7 @@ def link_of_row(a: float, alpha: float, d: float) -> FloatArray:
 
 
 def joint_frames(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Link poses in the world, (n, 4, 4), z along each joint's axis and moved by ``q``; and the flange,
-    (4, 4).
+    """Link poses (n, 4, 4) in the world, z along each joint's axis and moved by ``q``; and the flange pose (4, 4).
 
     Args:
         robot: the arm.
@@ -106,9 +108,7 @@ def shape_segments(robot: Robot, q: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def urdf(robot: Robot) -> str:
-    """The arm as URDF text: links ``link_0`` (base) .. ``link_n`` and ``flange``; joints by the robot's
-    names.
-    """
+    """The arm as URDF text: links ``link_0`` (base) .. ``link_n`` and ``flange``; joints named as the robot's."""
     lines = [f'<robot name="{robot.name}">']
     for i, mass in enumerate((10.0, *robot.masses.tolist())):
         lines.append(f'  <link name="link_{i}">')
@@ -196,7 +196,7 @@ def _cylinder(shape: Capsule) -> list[str]:
 
 
 def _middle(shapes: list[Capsule]) -> FloatArray:
-    """Middle (3,) of the box around the ends of ``shapes``."""
+    """Centre (3,) of the bounding box of the end points of ``shapes``."""
     ends = np.array([end for shape in shapes for end in (shape.start, shape.end)])
     return np.asarray(0.5 * (ends.max(axis=0) + ends.min(axis=0)))
 
@@ -251,4 +251,4 @@ RX90 = Robot(
     centres=np.stack([_middle([s for s in _RX90_SHAPES if s.link == k]) for k in range(1, 7)]),
     shapes=_RX90_SHAPES,
 )
-"""Six revolute joints after these rows."""
+"""Six revolute joints of `RX90_ROWS`."""

@@ -1,6 +1,4 @@
-"""Ground truth of the simulated cell: arm, marker body and cameras in one world, and noise-free images of the
-markers.
-"""
+"""Ground truth of the simulated cell: arm, marker body and cameras in one world, and noise-free marker images."""
 
 from __future__ import annotations
 
@@ -18,16 +16,17 @@ from stereoservo_sim.world.synthetic import rotation, translation
 from stereoservo_sim.world.workpiece import Moved, Workpiece, plate_body
 
 MAX_INCIDENCE = float(np.deg2rad(72.0))
-"""Angle between line of sight and face normal beyond which no detector is expected to measure a dot."""
+"""Angle between line of sight and face normal beyond which a dot counts as not measurable."""
 
 
 @dataclass(frozen=True, eq=False)
 class SimulatedCell:
     """Arm, body, cameras; ``base`` (n,) [rad] is the configuration around which the cell is laid out.
 
-    Eye-to-hand the body is on the flange and the rig stands in the world. Where ``stand`` (4, 4) is given, the body
-    stands there in the world, and the rig, given in the flange's frame, is carried (eye-in-hand). ``workpiece``: what
-    stands beside the body, where there is one.
+    Eye-to-hand: the body is on the flange and the rig is fixed in the world. Eye-in-hand: ``stand`` (4, 4) is the
+    body's
+    fixed pose in the world, and the flange carries the rig, which is given in its frame. ``workpiece``: a second marked
+    object beside the body, if any.
     """
 
     robot: Robot
@@ -55,7 +54,7 @@ class SimulatedCell:
         return camera if self.stand is None else camera.moved(self.flange(q))
 
     def marker_positions(self, q: FloatArray) -> FloatArray:
-        """Markers in the world at ``q`` (n,), (m, 3) [m], rows as ``body.ids``."""
+        """Markers in the world at ``q`` (n,), (m, 3) [m], rows in the order of ``body.ids``."""
         pose = self.body_pose(q)
         return self.body.marker_points @ pose[:3, :3].T + pose[:3, 3]
 
@@ -67,13 +66,14 @@ class SimulatedCell:
         return self.marker_positions(q) @ frame[:3, :3].T + frame[:3, 3]
 
     def truth_pixels(self, q: FloatArray) -> dict[str, FloatArray]:
-        """Noise-free raw pixels of all marker centres at ``q`` (n,), seen or not: camera name -> (m, 2)."""
+        """Noise-free raw pixels of all marker centres at ``q`` (n,), visible or not: camera name -> (m, 2)."""
         points = self.marker_positions(q)
         return {camera.name: self.in_world(camera, q).image_of(points)[0] for camera in self.rig.cameras}
 
     def visible(self, q: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE) -> BoolArray:
-        """Which markers ``camera`` of the rig sees at ``q`` (n,), (m,): as :meth:`turned_to`, and no link
-        stands before them.
+        """Mask (m,) of the markers that ``camera`` of the rig sees at ``q`` (n,): those of :meth:`turned_to` that no
+        link
+        occludes.
         """
         camera = self.in_world(camera, q)
         seen = self.turned_to(self.body_pose(q), camera, max_incidence=max_incidence)
@@ -81,18 +81,18 @@ class SimulatedCell:
         return seen & ~self._behind_arm(q, points, camera.centre)
 
     def turned_to(self, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE) -> BoolArray:
-        """Which markers of the body at ``pose`` have their whole dot in the image and their face turned to
-        ``camera``, (m,).
+        """Mask (m,) of the body's markers with their whole dot in the image and their face turned to ``camera``.
 
-        ``pose`` (4, 4) of body and camera in one frame; it may be one that the arm does not take.
+        ``pose`` (4, 4) of the body in the camera's frame of reference; the arm need not be able to reach it.
         """
         return turned_to(self.body, pose, camera, max_incidence=max_incidence)
 
     def workpiece_visible(
         self, q: FloatArray, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
     ) -> BoolArray:
-        """Which markers of the workpiece at ``pose`` (4, 4) in the world ``camera`` of the rig sees, (m,): as
-        :meth:`visible`. That the body hides it is not looked for. Raises ValueError where there is no workpiece.
+        """Mask (m,) of the workpiece's markers that ``camera`` of the rig sees, with the workpiece at ``pose`` (4, 4)
+        in the
+        world; as :meth:`visible`. Occlusion by the body is not checked. Raises ValueError if there is no workpiece.
         """
         if self.workpiece is None:
             raise ValueError("this cell has no workpiece")
@@ -105,7 +105,7 @@ class SimulatedCell:
         ends, radii = shape_segments(self.robot, q)
         hidden = np.zeros(len(points), dtype=np.bool_)
         for (start, end), radius in zip(ends, radii, strict=True):
-            # Start a little in front of the dot: the mount behind the plate is no obstacle.
+            # Start slightly in front of the dot: the mount behind the plate does not occlude it.
             hidden |= _segment_distance(points + 0.02 * (eye - points), eye, start, end) < radius
         return hidden
 
@@ -113,8 +113,8 @@ class SimulatedCell:
 def turned_to(
     body: MarkerBody, pose: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE
 ) -> BoolArray:
-    """Which markers of ``body`` at ``pose`` (4, 4) have their whole dot in the image and their face turned to
-    ``camera``, (m,).
+    """Mask (m,) of the markers of ``body`` at ``pose`` (4, 4) with their whole dot in the image and their face turned
+    to ``camera``.
     """
     points = body.marker_points @ pose[:3, :3].T + pose[:3, 3]
     normals = body.marker_normals @ pose[:3, :3].T
@@ -165,8 +165,8 @@ def solid_cell(light: tuple[float, float, float] = LIGHT) -> SimulatedCell:
 
 @lru_cache(maxsize=1)
 def workpiece_cell() -> SimulatedCell:
-    """The same cell with a workpiece that stands nearer to the cameras, at the upper left of both images: on no path
-    between the base and DEMO_GOALS, and at no calibration stop, does it hide the body.
+    """The same cell with a workpiece nearer to the cameras, at the upper left of both images. It does not occlude the
+    body on any path between the base and DEMO_GOALS, nor at any calibration stop.
     """
     cell = demo_cell()
     rig_to_workpiece = translation(-0.223, -0.155, 1.0) @ rotation("y", 12.0) @ rotation("z", 7.0)
@@ -175,7 +175,7 @@ def workpiece_cell() -> SimulatedCell:
 
 @lru_cache(maxsize=1)
 def hand_cell() -> SimulatedCell:
-    """The same arm with the stereo rig on its flange, before the same body that stands 0.85 m away."""
+    """The same arm with the stereo rig on its flange, before the same body, which is fixed 0.85 m away."""
     base = demo_cell().base
     body = roof_body()
     flange_to_rig = translation(0.03, -0.02, 0.07) @ rotation("z", 8.0) @ rotation("x", -2.0)
@@ -193,8 +193,8 @@ DEMO_GOALS: dict[str, FloatArray] = {
     "roll": np.array([-0.192416, -1.27605, -0.515402, 0.079712, 0.702957, 3.181643]),
     "far": np.array([0.20, -1.52, -0.57, 0.33, 0.61, -1.82]),
 }
-"""Configurations [rad] worth going to. Both cameras see every marker at them and on the way between any
-two of them or the base, along straight lines in joint space and in Cartesian space.
+"""Goal configurations [rad]. Both cameras see every marker at them and on the path between any two of them or the
+base, along straight lines in joint space and in Cartesian space.
 
 From the base: ``near`` is 29 degrees and 0.12 m away, ``roll`` 180 degrees about the line of
 sight and 0.14 m, ``far`` 94 degrees and 0.37 m.
@@ -205,7 +205,7 @@ HAND_GOALS: dict[str, FloatArray] = {
     "roll": np.array([-0.111708, -1.3627, -0.281001, 0.358958, 0.572148, 2.901605]),
     "far": np.array([0.37, -1.41, -0.39, 0.52, 1.19, -1.96]),
 }
-"""The same for :func:`hand_cell`: the body as the carried rig sees it turns by 33, 180 and 82 degrees and moves by
+"""The same for :func:`hand_cell`: seen by the carried rig, the body rotates by 33, 180 and 82 degrees and moves by
 0.18, 0.14 and 0.39 m.
 """
 

@@ -1,7 +1,6 @@
 """Synthetic cells: an arm, cameras and markers, with pixels from exact projections and noise; no images.
 
-The common truth of experiments, benchmarks, campaigns and tests: Euclidean, known to the last digit, and used
-for evaluation only.
+Ground truth of experiments, benchmarks, campaigns and tests: Euclidean, exact, and used for evaluation only.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 Kind = Literal["revolute", "prismatic"]
 
 FIRST_MARKER = 10
-"""Id of the first marker: ids are no indices."""
+"""Id of the first marker, so that ids differ from indices."""
 
 
 def translation(x: float, y: float, z: float) -> FloatArray:
@@ -49,10 +48,12 @@ def dh_link(a: float, alpha: float, d: float) -> FloatArray:
 class SyntheticCell:
     """A synthetic arm before cameras.
 
-    ``base`` (4, 4): the arm's base in the rig's frame, or with ``mount`` eye-in-hand the base in the frame of the
-    markers. ``links`` (4, 4) each, fixed, after the joint about or along its z. ``body`` (m, 3): markers in the
-    flange's frame, or where they stand. ``intrinsics`` (c, 3, 3), ``lenses`` (c, 4 or 7), ``poses`` (c, 4, 4) from the
-    rig (eye-in-hand: the flange) to each camera. ``home`` (n,), ``ranges`` (n,): trials go from -range to +range.
+    ``base`` (4, 4): the arm's base in the rig's frame; if ``mount`` is eye-in-hand, in the frame of the markers.
+    ``links`` (4, 4) each: fixed, after the joint about or along its z.
+    ``body`` (m, 3): markers in the flange's frame, or in their own.
+    ``intrinsics`` (c, 3, 3), ``lenses`` (c, 4 or 7), ``poses`` (c, 4, 4) from the rig (eye-in-hand: the flange) to each
+    camera.
+    ``home`` (n,), ``ranges`` (n,): trials go from -range to +range.
     """
 
     base: FloatArray
@@ -148,7 +149,7 @@ class SyntheticCell:
     ) -> TrialData:
         """Trial data with Gaussian noise of ``sigma`` [px] an axis; ``stated``: the sigma reported by the detector.
 
-        Every marker is seen at every stop; ask ``in_view`` where that matters.
+        Every marker is reported at every stop, whether in the image or not: see ``in_view``.
         """
         configurations, moved = self.stops(stops) if positions is None else positions
         exact = self.pixels(configurations)
@@ -169,13 +170,13 @@ class SyntheticCell:
         return replace(self, body=np.asarray(body, dtype=np.float64))
 
     def lens_of(self, camera: int, k1: float, k2: float = 0.0, p1: float = 0.0, p2: float = 0.0) -> FloatArray:
-        """Lens (7,) of OpenCV's first coefficients about a camera's principal point, as with square pixels."""
+        """Lens (7,) of OpenCV's first coefficients about a camera's principal point; square pixels are assumed."""
         K, r0 = self.intrinsics[camera], 0.5 * self.width
         share = r0 / float(np.sqrt(K[0, 0] * K[1, 1]))
         return np.array([k1 * share**2, K[0, 2], K[1, 2], r0, k2 * share**4, p1 * share, p2 * share])
 
     def with_k1(self, k1: float) -> SyntheticCell:
-        """The same cell through lenses of Brown's ``k1`` about each principal point (OpenCV's first coefficient)."""
+        """The same cell with lenses of Brown's ``k1`` about each principal point (OpenCV's first coefficient)."""
         r0 = 0.5 * self.width
         lenses = [(k1 * r0**2 / (K[0, 0] * K[1, 1]), K[0, 2], K[1, 2], r0) for K in self.intrinsics]
         return replace(self, lenses=np.array(lenses))
@@ -224,7 +225,7 @@ def placed(
 ) -> SyntheticCell:
     """The cell with the body's centre ``distance`` [m] before the rig at home.
 
-    ``facing`` (4, 4) turns the flange in the rig's frame, or with eye-in-hand the markers as they stand.
+    ``facing`` (4, 4) rotates the flange in the rig's frame (eye-in-hand: the markers).
     """
     K, poses = stereo_pair() if cameras is None else cameras
     home, ranges = np.asarray(home, dtype=np.float64), np.asarray(ranges, dtype=np.float64)
@@ -247,7 +248,7 @@ def _facing(*turns: tuple[Literal["x", "y", "z"], float]) -> FloatArray:
 RX90_ROWS = ((0, -90, 0.42), (0.40, 0, 0), (0, 90, 0), (0, -90, 0.80), (0, 90, 0), (0, 0, 0.085))
 """Six revolute joints with a spherical wrist, rows (a [m], alpha [°], d [m]) after the Stäubli RX 90 (5.5)."""
 OFFSET_ROWS = ((0, -90, 0.36), (0.45, 0, 0.12), (0.4, 0, 0), (0, -90, 0.11), (0, 90, 0.095), (0, 0, 0.08))
-"""Six revolute joints whose last three axes do not meet."""
+"""Six revolute joints, the last three axes not intersecting."""
 SEVEN_ROWS = ((0, -90, 0.36), (0, 90, 0), (0, 90, 0.42), (0, -90, 0), (0, -90, 0.40), (0, 90, 0), (0, 0, 0.126))
 """Seven revolute joints, shoulder, elbow and wrist."""
 
@@ -344,7 +345,7 @@ def mixed() -> SyntheticCell:
 
 
 def parallel(body: FloatArray | None = None) -> SyntheticCell:
-    """Cell of three parallel revolute axes, which determine no plane at infinity."""
+    """Cell of three parallel revolute axes, which do not determine the plane at infinity."""
     links = (translation(0.3, 0, 0), translation(0.25, 0, 0), translation(0.05, 0, 0))
     return placed(
         ("revolute",) * 3,

@@ -1,4 +1,4 @@
-"""Simulated drives of velocities or positions: ramps, limits, time-out; interface of the plant that they move."""
+"""Simulated drives controlled by velocity or position: ramps, limits, time-out; interface of the plant they move."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointSpec
 
 STIFFNESS = 500.0
-"""Of an ideal joint's drive at a wall [N m/rad or N/m]."""
+"""Stiffness of an ideal joint's drive at a wall [N m/rad or N/m]."""
 REST_VELOCITY = 1e-9
-"""Below this [rad/s or m/s] a physics engine's joint is at rest."""
+"""Speed below which a physics engine's joint is at rest [rad/s or m/s]."""
 
 
 class Plant(Protocol):
-    """Protocol of what the drives move. ``positions``, ``velocities`` of the links, ``efforts`` of the motors [N m or
-    N], (n,): the truth.
+    """Protocol of the plant that the drives move. True ``positions``, ``velocities`` of the links and ``efforts`` of
+    the
+    motors [N m or N], (n,).
     """
 
     positions: FloatArray
@@ -27,12 +28,12 @@ class Plant(Protocol):
 
     @property
     def motors(self) -> FloatArray:
-        """Angles of the motors (n,), in units of the joints: what the drives' set-points are of."""
+        """Angles of the motors (n,), in units of the joints; the drives' set-points refer to them."""
         ...
 
     @property
     def readings(self) -> FloatArray:
-        """Angles at the encoders (n,), before they are rounded to steps."""
+        """Angles at the encoders (n,), before quantisation."""
         ...
 
     @property
@@ -45,7 +46,7 @@ class Plant(Protocol):
         ...
 
     def rest(self, h: float) -> bool:
-        """Let ``h`` [s] pass if nothing moves or is about to; whether that is so."""
+        """Let ``h`` [s] pass if nothing moves or is about to; returns whether that is so."""
         ...
 
     def close(self) -> None:
@@ -54,35 +55,35 @@ class Plant(Protocol):
 
 
 class RigidPlant:
-    """Base of plants whose joints are rigid: motor, link and encoder turn alike."""
+    """Base of plants with rigid joints: motor, link and encoder move alike."""
 
     positions: FloatArray
     velocities: FloatArray
 
     @property
     def motors(self) -> FloatArray:
-        """Angles of the motors (n,): the links'."""
+        """Angles of the motors (n,), equal to the links'."""
         return self.positions
 
     @property
     def readings(self) -> FloatArray:
-        """Angles at the encoders (n,): the links'."""
+        """Angles at the encoders (n,), equal to the links'."""
         return self.positions
 
     @property
     def reading_rates(self) -> FloatArray:
-        """Velocities at the encoders (n,): the links'."""
+        """Velocities at the encoders (n,), equal to the links'."""
         return self.velocities
 
     def rest(self, h: float) -> bool:
-        """Whether nothing moves; passing time changes nothing then."""
+        """Whether nothing moves; then time that passes changes nothing."""
         return bool(np.all(np.abs(self.velocities) < REST_VELOCITY))
 
 
 class IdealPlant(RigidPlant):
     """Massless joints that follow their set-points exactly; efforts come from walls alone.
 
-    ``walls`` (2, n): no joint goes below the first or above the second; its drive then pushes with ``STIFFNESS``.
+    ``walls`` (2, n): least and largest position of each joint; at a wall its drive pushes with ``STIFFNESS``.
     """
 
     def __init__(self, positions: FloatArray) -> None:
@@ -92,7 +93,7 @@ class IdealPlant(RigidPlant):
         self.walls = np.array([np.full_like(positions, -np.inf), np.full_like(positions, np.inf)])
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
-        """Adopt the set-points, as far as walls permit."""
+        """Adopt the set-points, limited by the walls."""
         self.positions = np.clip(set_positions, self.walls[0], self.walls[1])
         beyond = set_positions - self.positions
         self.velocities = np.where(beyond != 0.0, 0.0, set_velocities)
@@ -116,9 +117,11 @@ def ramp(
 class DriveBank:
     """Velocity drives of all joints on a fixed time grid, with a common command time-out.
 
-    The set-points are advanced in steps of ``step_ns``, never beyond the asked time. After ``timeout_ns``
-    without a command the drives brake by themselves; once they stand, time that passes is skipped, so
-    that catching up after a stall costs at most the time-out and the brake ramp.
+    The set-points advance in steps of ``step_ns``, never beyond the requested time. After ``timeout_ns`` without a
+    command
+    the drives brake by themselves; once they are at rest, time is skipped, so that catching up after a stall costs at
+    most
+    the time-out and the brake ramp.
     """
 
     def __init__(
@@ -144,7 +147,7 @@ class DriveBank:
         return self._q
 
     def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Apply a velocity command (n,) given at ``t_ns``; returns what is sent to the drives, and why it differs."""
+        """Apply a velocity command (n,) given at ``t_ns``; returns the one sent to the drives, and why it differs."""
         self.advance(t_ns)
         sent = np.clip(velocities, -self._velocity, self._velocity)
         reasons = () if np.array_equal(sent, velocities) else ("drive_velocity_limit",)
@@ -171,7 +174,7 @@ class DriveBank:
                     return
             steps = 1
             if isinstance(self.plant, IdealPlant):
-                # The ramp is exact over any time: one step up to the next event.
+                # The ramp is exact over any time: one step to the next event.
                 end = now_ns if self.t_ns >= self._deadline_ns else min(now_ns, self._deadline_ns)
                 steps = max((end - self.t_ns) // self._step_ns, 1)
             h = steps * self._step_ns * 1e-9
@@ -193,10 +196,10 @@ class DriveBank:
 
 
 class PositionBank(DriveBank):
-    """Position drives of all joints: set-points go to the newest orders within ``period_ns``, no faster than a joint
-    can, and stay there when no more come: these drives watch nobody.
+    """Position drives of all joints: set-points move to the newest ordered positions within ``period_ns``, limited by
+    each joint's speed, and stay there if no more come: these drives have no time-out.
 
-    ``order``: positions (n,) to order for commanded velocities (n,), asked once a period.
+    ``order``: function from commanded velocities (n,) to ordered positions (n,), called once per period.
     """
 
     def __init__(
@@ -209,10 +212,12 @@ class PositionBank(DriveBank):
         self._orders, self._speed = self._q.copy(), np.zeros_like(self._q)
 
     def command(self, t_ns: int, velocities: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """As of velocity drives: what is sent (n,) is what the orders are led by."""
+        """Apply a velocity command (n,), limited to the joints' speeds; the orders follow it. Returns the limited
+        command (n,), and why it differs.
+        """
         self.advance(t_ns)
         sent = np.clip(velocities, -self._velocity, self._velocity)
-        if t_ns - self._due_ns > self._timeout_ns:  # nothing was commanded meanwhile
+        if t_ns - self._due_ns > self._timeout_ns:  # no command in the meantime
             self._due_ns = t_ns
         while self._due_ns <= t_ns:
             self._due_ns += self._period_ns
@@ -222,7 +227,7 @@ class PositionBank(DriveBank):
         return sent, () if np.array_equal(sent, velocities) else ("drive_velocity_limit",)
 
     def brake(self, t_ns: int) -> None:
-        """Stay at the set-points of ``t_ns``."""
+        """Hold the set-points of ``t_ns``."""
         self.advance(t_ns)
         self._orders = self._q.copy()
 

@@ -1,8 +1,8 @@
 """The simulated workpiece: a plate of two small faces beside the marker body, static until it is moved on request.
 
-Its present pose, or its motion, is in a file in the cell's runtime directory, so that a shell, a test or a
-demonstration can move it while the cell runs, whichever processes its cameras live in. With cameras on the arm the same
-file moves the marker body that they look at.
+Its current pose, or its motion, is in a file in the cell's runtime directory, so that a shell, a test or a
+demonstration can move it while the cell runs, in whichever processes its cameras run. With cameras on the arm the same
+file moves the marker body that they observe.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ TILT = float(np.deg2rad(25.0))
 
 
 class MovedFileError(Exception):
-    """Invalid content of the file that moves a thing; the text names the file and what would be valid."""
+    """The file that moves an object has invalid content; the text names the file and states what would be valid."""
 
 
 class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -40,7 +40,7 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def matrix(self) -> FloatArray:
-        """Displacement (4, 4): rotation about the origin, then translation. Raises ValueError where not finite."""
+        """Displacement (4, 4): rotation about the origin, then translation. Raises ValueError if not finite."""
         if not np.isfinite([*self.shift_m, *self.turn_deg]).all():
             raise ValueError(f"shift_m {self.shift_m} and turn_deg {self.turn_deg} must be finite numbers")
         pose = np.eye(4)
@@ -55,10 +55,12 @@ class Moved(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Motion(Moved, frozen=True, forbid_unknown_fields=True):
-    """A displacement that goes on: at ``velocity_m_s``, turning at ``turn_rate_deg_s`` about an axis through
-    ``about_m`` [m] off its origin (a turntable's), and swinging along ``swing_m`` at ``swing_hz``, from the monotonic
-    time ``since_ns`` on (None: from when its file was written), for ``for_s``, and every ``every_s`` anew from where it
-    began.
+    """A continuing displacement, from the monotonic time ``since_ns`` on (None: since its file was written) for
+    ``for_s``.
+
+    It translates at ``velocity_m_s``, rotates at ``turn_rate_deg_s`` about an axis through ``about_m`` [m] from its
+    origin
+    (a turntable's), and oscillates along ``swing_m`` at ``swing_hz``; it restarts from its beginning every ``every_s``.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)
@@ -109,9 +111,9 @@ def moved_pose(stand: FloatArray, moved: Moved) -> FloatArray:
 
 
 def plate_body(tilt: float = TILT) -> MarkerBody:
-    """The upper and the lower face, ridge towards the viewer, each inclined by ``tilt`` [rad].
+    """Body of an upper and a lower face, ridge towards the viewer, each inclined by ``tilt`` [rad].
 
-    The frame is the viewer's: origin in the middle of the ridge, x right, y down, z away from him.
+    The viewer's frame: origin in the middle of the ridge, x right, y down, z away from the viewer.
     """
     c, s = np.cos(tilt), np.sin(tilt)
     poses = []
@@ -123,7 +125,7 @@ def plate_body(tilt: float = TILT) -> MarkerBody:
 
 
 class MovedFile:
-    """File with the present displacement of a thing in the cell's runtime directory; read again when changed.
+    """File in the cell's runtime directory with the current displacement of an object; read again when it changes.
 
     ``name``: of the file; by default the workpiece's.
     """
@@ -134,7 +136,7 @@ class MovedFile:
         self._moved: Moved = Moved()
 
     def write(self, moved: Moved) -> None:
-        """Write a displacement or motion atomically; it acts from the next shutter on. Raises OSError, ValueError."""
+        """Write a displacement or motion atomically; effective from the next shutter on. Raises OSError, ValueError."""
         if not np.isfinite(moved.matrix).all():
             raise ValueError(f"{moved} is no displacement")
         fresh = self.path.with_name(f"{self.path.name}.{os.getpid()}")
@@ -142,9 +144,7 @@ class MovedFile:
         fresh.replace(self.path)
 
     def now(self, otherwise: Moved = Moved(), t_ns: int | None = None) -> Moved:  # noqa: B008 - frozen
-        """Present displacement, of a motion at ``t_ns``; ``otherwise`` where there is no file. Raises
-        MovedFileError.
-        """
+        """Current displacement, of a motion at ``t_ns``; ``otherwise`` if there is no file. Raises MovedFileError."""
         try:
             status = self.path.stat()
             seen = (status.st_ino, status.st_mtime_ns, status.st_size)

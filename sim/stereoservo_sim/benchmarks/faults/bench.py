@@ -1,10 +1,10 @@
 """``bench faults``: injects every fault of the CAN arm, of the service and of its inputs, and measures the time to
 detection and to rest.
 
-In real time, driver and emulated drives are two processes over serial-line CAN on TCP. From the order (or the signal)
-to the last axis's rest, by the emulator's events; both are CLOCK_MONOTONIC. Machines are shared: a fault that comes
-before it was ordered is a stall's, is counted and tried again; beside the times stand how late the emulator's loop
-came.
+In real time, driver and emulated drives are two processes over serial-line CAN on TCP. Times are from the order (or the
+signal) to the rest of the last axis, by the emulator's events; both are CLOCK_MONOTONIC. Machines are shared: a fault
+before its order is due to a stall, is counted, and the trial is repeated; the lateness of the emulator's loop is
+reported beside the times.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ from stereoservo_sim.progress import ProgressCall
 
 CELL = "hil-can"
 SPEED = 0.125
-"""[rad/s]; at the cell's quick-stop deceleration a ramp of 12.5 ms."""
+"""[rad/s]; with the cell's quick-stop deceleration the ramp takes 12.5 ms."""
 STRICT = {
     "heartbeat_timeout_ms": 100,
     "rpdo_deadline_ms": 0,
@@ -57,7 +57,7 @@ STRICT = {
     "command_timeout_s": 0.1,
     "loop_timeout_ms": 100,
 }
-"""The table's settings: the options' defaults; the drives' own watch is on the heartbeat alone."""
+"""Settings of the table: the options' defaults; the drives monitor the heartbeat alone."""
 TRIES = 4
 REST_LIMIT_S = 2.0
 RUN_ON_S = 0.5
@@ -77,7 +77,7 @@ ORDERED = (
     ("babbling node", "flood 1", "calm 1", 60.0),
     ("adapter gone", "adapter out", "adapter in", 150.0),
 )
-"""Fault, order, what ends it, bound [ms] in bit time."""
+"""Fault, its order, the order that ends it, bound [ms] in bit time."""
 DONE_TO_THE_MASTER = ("master killed", "master process hangs", "servo loop hangs")
 MASTER_BOUND_MS = 150.0
 
@@ -106,7 +106,7 @@ class _Master:
         self.lines.put({"event": "ended"})
 
     def expect(self, event: str, limit_s: float) -> dict[str, Any]:
-        """The next line, which must be ``event``. Raises StalledError with what came instead."""
+        """The next line, which must be ``event``. Raises StalledError with the line received instead."""
         try:
             line = self.lines.get(timeout=limit_s)
         except queue.Empty:
@@ -116,7 +116,7 @@ class _Master:
         return line
 
     def fault(self) -> dict[str, Any] | None:
-        """The first fault that it reported, if any."""
+        """The first fault reported, if any."""
         while not self.lines.empty():
             line = self.lines.get()
             if line["event"] == "fault":
@@ -195,9 +195,9 @@ def _settle(emulator: EmulatorProcess, cure: str) -> None:
 
 
 def run_wall(repetitions: int, progress: Callable[[int, int], None]) -> dict[str, Any]:
-    """Rows of all faults, ``repetitions`` trials each, and how steadily the emulator's loop ran.
+    """Rows of all faults, ``repetitions`` trials each, and the lateness of the emulator's loop.
 
-    Raises ExperimentError where the emulated drives end.
+    Raises ExperimentError if the emulated drives end.
     """
     cases = [*ORDERED, *((fault, "", "", MASTER_BOUND_MS) for fault in DONE_TO_THE_MASTER)]
     options, _ = drives_of_cell(load_cell_file(shipped_cell_path(CELL)))
@@ -255,15 +255,17 @@ def _row(
 # -- the bench -------------------------------------------------------------------------------------------------
 
 WALL_SHARE = 3
-"""For so many trials in bit time one in real time, which takes seconds."""
+"""Trials in bit time per trial in real time, which takes seconds."""
 
 
 def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
-    """``rows``: of the drives in the emulator's bit time, ``repetitions`` trials a fault, alike for one seed. ``wall``:
-    of the drives in real time. ``service``: of the whole daemon in real time. ``inputs``: of joint samples, camera
-    frames and the clock in virtual time, ``repetitions`` trials a fault, alike for one seed.
+    """Run all fault trials, reproducible for one seed except in real time.
 
-    Raises ExperimentError where a trial cannot begin, or the emulated drives or a daemon end.
+    ``rows``: of the drives in the emulator's bit time, ``repetitions`` trials a fault. ``wall``: of the drives in real
+    time. ``service``: of the whole daemon in real time. ``inputs``: of joint samples, camera frames and the clock in
+    virtual time, ``repetitions`` trials a fault.
+
+    Raises ExperimentError if a trial cannot begin, or the emulated drives or a daemon end.
     """
     cases = [(protocol, case) for protocol, those in CASES.items() for case in those]
     rows = []
@@ -289,7 +291,7 @@ def run_faults(repetitions: int, seed: int, progress: ProgressCall) -> dict[str,
 
 
 def _tell_row(row: dict[str, Any]) -> None:
-    """One row of the service as it comes, on stderr."""
+    """Print one row of the service when it is complete, on stderr."""
     print(
         f"{row['fault']}: rest {_summary(row['rest_ms'])} ms of {row['bound_ms']}, within {row['within']} of "
         f"{row['trials']}, after {', '.join(row['after'])}; a trial takes {_summary(row['trial_s'])} s",
@@ -298,7 +300,7 @@ def _tell_row(row: dict[str, Any]) -> None:
 
 
 def _tell_input(row: dict[str, Any]) -> None:
-    """One row of the inputs as it comes, on stderr."""
+    """Print one row of the inputs when it is complete, on stderr."""
     print(
         f"{row['input']}, {row['fault']}, goal by {row['goal']}: rest {_summary(row['rest_ms'])} ms of "
         f"{row['bound_ms']}, within {row['within']} of {row['trials']}, works again {row['works_again']}",
@@ -307,7 +309,7 @@ def _tell_input(row: dict[str, Any]) -> None:
 
 
 def show_faults(figures: dict[str, Any], console: Console) -> dict[str, Any]:
-    """The tables; what is left of the figures."""
+    """Print the tables; returns the remaining figures."""
     rows, wall = figures["rows"], figures["wall"]
     title = (
         f"{figures['axes']} axes at {figures['rate_hz']:g} Hz, ramps of {figures['ramp_ms']:g} ms, "
@@ -372,7 +374,7 @@ def _wall_cells(row: dict[str, Any]) -> dict[str, str]:
 
 
 def service_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
-    """A row of the service likewise."""
+    """A row of the service as text, by column; ``digits`` as in `drive_cells`."""
     return {
         "fault": row["fault"],
         "all at rest": _summary(row["rest_ms"], digits) if row["rest_ms"] else "goes on",
@@ -387,7 +389,7 @@ def service_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
 
 
 def input_cells(row: dict[str, Any], digits: int = 1) -> dict[str, str]:
-    """A row of the inputs likewise."""
+    """A row of the inputs as text, by column."""
     return {
         "input": row["input"],
         "fault": row["fault"],

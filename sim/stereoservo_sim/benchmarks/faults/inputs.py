@@ -1,8 +1,8 @@
-"""Fault trials of what the core is told, in virtual time: joint samples, camera frames and the clock, each wrong in one
-way from one moment on, while the arm moves to a goal by joints or by images in lockstep.
+"""Fault trials of the core's inputs in virtual time: joint samples, camera frames and the clock, each wrong in one
+respect from one moment on, while the arm moves to a goal by joints or by images in lockstep.
 
-The time to rest is by the arm's true joints. ``bound_ms`` is the time after which the core must notice, and the ramp
-from full speed; afterwards the cause goes, an operator acts, and the arm must reach a goal again.
+The time to rest is measured on the arm's true joints. ``bound_ms`` is the time limit for detection plus the ramp from
+full speed; afterwards the cause is removed, an operator acts, and the arm must reach a goal again.
 """
 
 from __future__ import annotations
@@ -42,12 +42,12 @@ from stereoservo_sim.world.simulated_cell import demo_cell
 CELL_SEED = 5
 LAWS: tuple[LawName, ...] = ("stereo", "image", "cartesian3")
 FAST = 0.15
-"""[rad/s] Of any joint, when the fault comes."""
+"""Speed of some joint at which the fault is injected [rad/s]."""
 WATCHED_S = 2.0
 OF_MOTION = {"ACCELERATION_LIMITED", "BRAKING", "NEAR_SINGULAR"}
-"""Reasons that tell how the arm moves, not what is wrong."""
+"""Reasons that describe the arm's motion, not a fault."""
 UPTIME_NS = 7_200_000_000_000
-"""Of the machine when a trial begins: a clock that is set back does not become negative."""
+"""Uptime of the machine at the start of a trial, so that a clock that is set back does not become negative."""
 REACHES_S = 30.0
 
 Past = list[Any]
@@ -56,23 +56,23 @@ Past = list[Any]
 
 @dataclass(frozen=True)
 class Draw:
-    """What is random of one trial's fault: a joint or marker, a share of a range, a sign."""
+    """Random choices of one trial's fault: a joint or marker, a share of a range, a sign."""
 
     which: int
     share: float
     sign: float
 
     def between(self, low: float, high: float) -> float:
-        """A number in the range, evenly."""
+        """A number in the range, uniform."""
         return low + self.share * (high - low)
 
     def time_ns(self, low_s: float, high_s: float) -> int:
-        """A time in the range, evenly by its logarithm."""
+        """A time in the range, log-uniform."""
         return round(1e9 * low_s * (high_s / low_s) ** self.share)
 
 
 Alter = Callable[[Past, int, Draw], Any]
-"""What comes in place of the newest sample, given all up to it, how many came since the fault (from 1), the draw."""
+"""Returns the replacement of the newest sample from all up to it, the number since the fault (from 1), and the draw."""
 
 
 class Input:
@@ -85,15 +85,15 @@ class Input:
         self._draw = Draw(0, 0.0, 1.0)
 
     def fail(self, alter: Alter, draw: Draw) -> None:
-        """Alter what comes from now on."""
+        """Alter samples from now on."""
         self._alter, self._draw, self._since = alter, draw, 0
 
     def mend(self) -> None:
-        """Pass on what comes."""
+        """Pass samples on unchanged."""
         self._alter = None
 
     def passed(self, sample: Any) -> Any:
-        """What the service is told in place of ``sample``."""
+        """The sample passed to the service in place of ``sample``."""
         self._past.append(sample)
         self._since += 1
         return sample if self._alter is None else self._alter(self._past, self._since, self._draw)
@@ -106,9 +106,9 @@ class Inputs:
         self.joints: Input = Input()
         self.cameras: list[Input] = [Input() for _ in cell.cameras]
         self.clock_ns = 0
-        """By which the core's time is off."""
+        """Error of the core's time."""
         self.stamps_ns = 0
-        """By which the stamps of all that it is told are off."""
+        """Error of the stamps of all inputs of the core."""
         read, advance = cell.joints.read_state, cell.core.advance
         cell.joints.read_state = lambda: self.joints.passed(read())  # type: ignore[method-assign]
         for camera, one in zip(cell.cameras, self.cameras, strict=True):
@@ -125,7 +125,7 @@ class Inputs:
         )
 
     def mend(self) -> None:
-        """All inputs are right again; a clock that all have in common stays where it is."""
+        """Correct all inputs; a clock common to all keeps its offset."""
         self.joints.mend()
         for camera in self.cameras:
             camera.mend()
@@ -137,7 +137,7 @@ def _polled(poll: Callable[[], list[CameraObservation]], camera: Input) -> Calla
 
 
 def _restamped(sample: Any, d_ns: int) -> Any:
-    """The sample, taken ``d_ns`` later."""
+    """The sample with its stamps ``d_ns`` later."""
     if isinstance(sample, JointState):
         return msgspec.structs.replace(sample, t_ns=sample.t_ns + d_ns)
     return msgspec.structs.replace(
@@ -145,7 +145,7 @@ def _restamped(sample: Any, d_ns: int) -> Any:
     )
 
 
-# -- what can be wrong with a sample of either kind -----------------------------------------------------------
+# -- faults of samples of either kind ---------------------------------------------------------------------------
 
 
 def _frozen(past: Past, since: int, draw: Draw) -> Any:
@@ -153,7 +153,7 @@ def _frozen(past: Past, since: int, draw: Draw) -> Any:
 
 
 def _late(low: int, high: int) -> Alter:
-    """So many samples late."""
+    """Samples delayed by a random number from ``low`` to ``high``."""
     return lambda past, since, draw: past[-1 - round(draw.between(low, high))]
 
 
@@ -162,7 +162,7 @@ def _twice(past: Past, since: int, draw: Draw) -> Any:
 
 
 def _reordered(past: Past, since: int, draw: Draw) -> Any:
-    """1, 3, 2, 4, 6, 5, …"""
+    """Order 1, 3, 2, 4, 6, 5, …"""
     return past[-1 - (0, 2, 1)[since % 3]]
 
 
@@ -243,7 +243,7 @@ def _fewer_pixels(past: Past, since: int, draw: Draw) -> CameraObservation:
 
 
 def _core_clock(sign: float) -> Callable[[Inputs, Draw], None]:
-    """The core's time alone."""
+    """Error of the core's time alone."""
 
     def step(inputs: Inputs, draw: Draw) -> None:
         inputs.clock_ns = round(sign * draw.time_ns(0.2, 3600.0))
@@ -252,7 +252,7 @@ def _core_clock(sign: float) -> Callable[[Inputs, Draw], None]:
 
 
 def _whole_clock(sign: float) -> Callable[[Inputs, Draw], None]:
-    """The time that the core, the drives and the cameras have in common."""
+    """Error of the time that the core, the drives and the cameras have in common."""
 
     def step(inputs: Inputs, draw: Draw) -> None:
         inputs.clock_ns = inputs.stamps_ns = round(sign * draw.time_ns(0.2, 3600.0))
@@ -273,11 +273,11 @@ def _cameras(alter: Alter, *, both: bool = True) -> Callable[[Inputs, Draw], Non
 
 
 RAMP_MS = 262.0
-"""From full speed to rest at the cell's acceleration limit, and three cycles."""
+"""From full speed to rest at the cell's acceleration limit, plus three cycles."""
 AT_ONCE_MS = 8.0
 JOINT_TIMEOUT_MS = 100.0
 COAST_MS = 550.0
-"""The cell's ``coast_s``, a frame and its latency."""
+"""The cell's ``coast_s``, plus a frame and its latency."""
 FOLLOWING_MS = 300.0
 
 
@@ -285,7 +285,7 @@ FOLLOWING_MS = 300.0
 class InputFault:
     """A fault of an input while the arm moves to a goal by ``joints``, by ``images``, or by either, as the trial draws.
 
-    ``notice_ms``: after which the arm must be braking; None where it goes on and reaches the goal.
+    ``notice_ms``: time limit until the arm must be braking; None if it continues and reaches the goal.
     """
 
     input: str
@@ -296,7 +296,7 @@ class InputFault:
 
 
 def _camera_faults() -> tuple[InputFault, ...]:
-    """Faults of cameras, which concern a goal by images, and not one by joints."""
+    """Faults of cameras; they affect a goal by images, and not one by joints."""
     faults = (
         ("frozen: no new frame", _cameras(_frozen), COAST_MS),
         ("picture frozen, stamps go on", _cameras(_still_picture), COAST_MS),
@@ -345,9 +345,9 @@ def run_inputs(
     tell: Callable[[dict[str, Any]], None],
     faults: tuple[InputFault, ...] = FAULTS,
 ) -> list[dict[str, Any]]:
-    """Rows of all faults, ``repetitions`` trials each, alike for one seed; ``tell`` gets each as it comes.
+    """Rows of all faults, ``repetitions`` trials each, reproducible for one seed; ``tell`` is called with each.
 
-    Raises ExperimentError where a trial cannot begin.
+    Raises ExperimentError if a trial cannot begin.
     """
     rows = []
     model = exact_simulated_model(demo_cell(), CELL_SEED)
@@ -379,14 +379,14 @@ def _row(fault: InputFault, trials: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _is_within(trial: dict[str, Any], bound_ms: float | None) -> bool:
-    """Whether the arm rested in time, or, without a bound, went on and reached the goal."""
+    """Whether the arm rested in time, or, without a bound, continued and reached the goal."""
     if bound_ms is None:
         return bool(trial["outcome"] == "goal_reached")
     return trial["rest_ms"] is not None and trial["rest_ms"] <= bound_ms
 
 
 class _Trial:
-    """One fault on a cell of its own."""
+    """One fault on a new cell."""
 
     def __init__(self, model: CellModel, fault: InputFault, rng: np.random.Generator) -> None:
         self.model, self.fault, self.rng = model, fault, rng
@@ -394,7 +394,7 @@ class _Trial:
         self.reasons: set[str] = set()
 
     def run(self) -> dict[str, Any]:
-        """What came of it."""
+        """The result of the trial."""
         with lockstep(fake_cell(), int(self.rng.integers(1 << 31)), self.truth) as (cell, _):
             self.cell, self.inputs = cell, Inputs(cell)
             self.operator = LockstepOperator(cell)
@@ -429,7 +429,7 @@ class _Trial:
         }
 
     def _goal(self) -> Goal:
-        """A goal near the base, with all markers in both images there."""
+        """A goal near the base at which all markers are in both images."""
         q = self._posture()
         while not (seen := _as_seen(q)):
             q = self._posture()
@@ -452,7 +452,7 @@ class _Trial:
         self.reasons |= {reason.code for reason in outputs.status.reasons} - OF_MOTION
 
     def _await_motion(self) -> None:
-        """Until the arm is fast, and a random time longer."""
+        """Run until the arm is fast, and for a random time longer."""
         for _ in range(500):
             self.cell.step()
             newest = self.truth.newest()
@@ -465,10 +465,10 @@ class _Trial:
         try:
             self.cell.wait_for(lambda e: e.id == goal.id and e.kind in TERMINAL, REACHES_S)
         except LockstepTimeoutError:
-            return  # the row tells that it has no end
+            return  # the row reports that it has no end
 
     def _rest_ms(self, start: int, t0_ns: int) -> float | None:
-        """From the fault to the last motion; None where the arm moves on."""
+        """Time from the fault to the last motion; None if the arm keeps moving."""
         moving = [t for t, v in self._speeds(start) if v > MOVING]
         last_ns = max(moving, default=t0_ns)
         return None if last_ns - t0_ns > (WATCHED_S - 0.1) * 1e9 else max(last_ns - t0_ns, 0) * 1e-6
@@ -484,7 +484,7 @@ class _Trial:
         return [(s[0], float((np.abs(s[2]) / limit).max())) for s in samples if s is not None]
 
     def _works_again(self) -> bool:
-        """Whether the arm reaches a goal once the cause has gone and an operator has acted."""
+        """Whether the arm reaches a goal after the cause is removed and an operator has acted."""
         cell = self.cell
         cell.on_step = None
         self.inputs.mend()
@@ -511,7 +511,7 @@ class _Trial:
 
 
 def _as_seen(q: FloatArray) -> dict[str, dict[int, tuple[float, float]]]:
-    """The markers in each camera's image with the arm at ``q`` (n,); empty where one is outside."""
+    """The markers in each camera's image with the arm at ``q`` (n,); empty if one is outside."""
     world = demo_cell()
     seen = world.truth_pixels(q)
     for camera in world.rig.cameras:

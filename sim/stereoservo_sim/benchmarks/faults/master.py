@@ -20,7 +20,7 @@ from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_sim.benchmarks.can_peer import LOOP_PRIORITY, real_time
 
 WARM_S = 0.6
-"""Time of motion before the fault; the monitors have learnt what is usual then."""
+"""Time of motion before the fault, in which the monitors learn normal values."""
 
 
 def say(event: str, **data: object) -> None:
@@ -41,7 +41,7 @@ def move(driver: CanJointDriver, speed: float) -> None:
                 driver.read_state()
                 driver.write_velocity(velocities)
             except DriverError:
-                pass  # told below; the loop goes on asking for motion, which must not come
+                pass  # reported below; the loop continues to request motion, which must not occur
         fault = driver.master.fault
         if fault is not None and not told["fault"]:
             told["fault"] = True

@@ -1,4 +1,4 @@
-"""Makes ``docs/reliability.md`` of what ``bench faults`` has measured:
+"""Generates ``docs/reliability.md`` from the results of ``bench faults``:
 
 ``stereoservo bench faults --json | python -m stereoservo_sim.benchmarks.faults.page > docs/reliability.md``.
 """
@@ -54,7 +54,7 @@ SERVICE = {
     "fault": "fault", "all at rest": "at rest", "bound": "bound", "within": "within", "after": "a second later",
     "status right": "status right", "ends of the goal": "ends", "status says": "what `status` says", "void": "void",
 }  # fmt: skip
-"""Of each table the cells that the page has, and their headings."""
+"""Cells of each table that are on the page, and their headings."""
 INPUTS = {
     name: name for name in
     ("input", "fault", "goal by", "at rest", "bound", "within", "after", "told", "goal", "ends", "works again")
@@ -69,11 +69,11 @@ PLACEHOLDERS = (
     (re.compile(r"\b\d{2}:\d{2}:\d{2}\b"), "HH:MM:SS"),
 )
 NUMBER = re.compile(r"(?<![A-Za-z\d.])\d+(?:\.\d+)?(?![A-Za-z\d])")
-"""Not one of a name (`j1`, `taught2`), nor of a unit or version behind it."""
+"""A number that is not part of a name (`j1`, `taught2`), nor before a unit or version."""
 
 
 def reliability_page(figures: dict[str, Any]) -> str:
-    """The page of the figures that ``bench faults --json`` has printed."""
+    """The page of the figures printed by ``bench faults --json``."""
     machine = figures["machine"]
     return PAGE.format(
         machine=f"{machine['processor']}, {machine['cores']} cores",
@@ -100,7 +100,7 @@ def _of_drives(row: dict[str, Any]) -> dict[str, str]:
 
 
 def distinct_sentences(said: list[str]) -> list[str]:
-    """Each sentence once, in order. Times become placeholders; sentences that then differ in numbers alone become one,
+    """Each sentence once, in order. Times become placeholders; sentences that then differ only in numbers become one,
     with `N` for each number that differs.
     """
     alike: dict[str, list[str]] = {}
@@ -112,7 +112,7 @@ def distinct_sentences(said: list[str]) -> list[str]:
 
 
 def _in_common(sentences: list[str]) -> str:
-    """Sentences that differ in numbers alone as one, with `N` for each number that differs."""
+    """Sentences that differ only in numbers, merged, with `N` for each number that differs."""
     numbers = [NUMBER.findall(sentence) for sentence in sentences]
     common = iter([given[0] if len(set(given)) == 1 else "N" for given in zip(*numbers, strict=True)])
     return NUMBER.sub(lambda _: next(common), sentences[0])

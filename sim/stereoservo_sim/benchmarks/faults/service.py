@@ -1,12 +1,12 @@
-"""Fault trials of the whole service in real time: a daemon with emulated drives, of which any process is killed or
-hung, whose files are damaged, whose clients die or are hostile while the arm moves to a goal, and what a person at the
-cell sees of it.
+"""Fault trials of the whole service in real time. A daemon runs with emulated drives; while the arm moves to a goal,
+its processes are killed or hung, its files are damaged, or its clients die or are hostile. The status that a person at
+the cell sees is checked, too.
 
-The time to rest is by the emulator's true joints. Machines are shared and stall: a trial in which the arm did not move
-when the fault came, or the machine stalled, is void, counted, and tried again.
+The time to rest is measured on the emulator's true joints. Machines are shared and stall: a trial is void, counted, and
+repeated if the arm did not move at the time of the fault, or the machine stalled.
 
 A cell's state may lie on a small disk, which is filled to the last byte, or becomes read-only while files on it are
-open. To mount them is root's.
+open. Mounting requires root.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from stereoservo_sim.world.history import TrueJointHistory
 
 DISK_MIB = 64
 RECORDS_S = 10.0
-"""After which a recording that was asked for has begun, or has not."""
+"""Time limit for a requested recording to begin."""
 GROWS_S = 20.0
-"""After which a flight ring that can be written again is."""
+"""Time limit for a flight ring to grow again once it can be written."""
 FILLS = """
 import sys, time
 zeros, full = bytes(1 << 20), False
@@ -57,21 +57,22 @@ with open(sys.argv[1], "ab", buffering=0) as file:
             full = True
             time.sleep(0.005)
 """
-"""Fills a disk to its last byte, and takes what becomes free."""
+"""Program that fills a disk to its last byte, including space that becomes free."""
 RING, RECORDING = "flight ring", "left out"
-"""Of the notes that nothing is recorded."""
+"""Texts in the notes that nothing is recorded."""
 
 
 def memory_disk(bench: ServiceBench) -> None:
-    """The state directory lies on a file system in memory. Raises VoidTrialError where nothing may be mounted."""
+    """Put the state directory on a file system in memory. Raises VoidTrialError if mounting is not allowed."""
     _mount(bench, bench.directories.state, "-t", "tmpfs", "-o", f"size={DISK_MIB}m,mode=700", "stereoservo")
 
 
 def image_disk(bench: ServiceBench) -> None:
-    """It lies on an ext4 in a file, which, unlike one in memory, becomes read-only while files on it are open: as a
-    disk with errors does. Raises VoidTrialError.
+    """Put it on an ext4 image, which, unlike a file system in memory, can become read-only while files on it are open,
+    as
+    a disk with errors does. Raises VoidTrialError.
 
-    The file is in memory: what is written to a disk that the drives and slots of the trial lie on could hold them up.
+    The image is in memory: writes to a disk shared with the trial's drives and slots could delay these.
     """
     memory = bench.folder / "memory"
     _mount(bench, memory, "-t", "tmpfs", "-o", f"size={2 * DISK_MIB}m,mode=700", "stereoservo")
@@ -90,7 +91,7 @@ def _mount(bench: ServiceBench, place: Path, *arguments: str) -> None:
 
 
 def _unmount(place: Path) -> None:
-    """At once, or, where a process still has files open, for all who come later."""
+    """Unmount now, or, if a process still has files open, for all later accesses."""
     try:
         _called("umount", str(place))
     except VoidTrialError:
@@ -107,7 +108,7 @@ def _called(*words: str) -> None:
 
 
 def full_disk(bench: ServiceBench) -> int:
-    """The disk is full; the flight is being recorded."""
+    """Fill the disk while the flight is being recorded."""
     _record(bench)
     filler = bench.directories.state / "filler"
     bench.lasting.callback(filler.unlink)
@@ -117,7 +118,7 @@ def full_disk(bench: ServiceBench) -> int:
 
 
 def read_only_disk(bench: ServiceBench) -> int:
-    """The file system is read-only from now on, for files that are open, too; the flight is being recorded."""
+    """Make the file system read-only, for open files, too, while the flight is being recorded."""
     _record(bench)
     t0_ns = time.monotonic_ns()
     _called("mount", "-o", "remount,abort,errors=remount-ro", str(bench.directories.state))
@@ -125,7 +126,7 @@ def read_only_disk(bench: ServiceBench) -> int:
 
 
 def _record(bench: ServiceBench) -> None:
-    """Record the flight, from the moment that the file is begun. Raises VoidTrialError."""
+    """Record the flight; returns once the file exists. Raises VoidTrialError."""
     with Client(CELL) as client:
         client.record()
         until = time.monotonic() + RECORDS_S
@@ -136,8 +137,8 @@ def _record(bench: ServiceBench) -> None:
 
 
 def records_again(bench: ServiceBench) -> str:
-    """What is wrong with recording now that there is room: the flight ring goes on, a recording that is asked for
-    begins; empty where nothing is.
+    """Failures of recording after space has become available: the flight ring must continue, and a requested recording
+    must begin; empty if none.
     """
     until = time.monotonic() + GROWS_S
 
@@ -161,9 +162,7 @@ def records_again(bench: ServiceBench) -> str:
 
 
 def starts_again(bench: ServiceBench) -> str:
-    """What is wrong with a daemon that ends, and one that starts, on a disk that cannot be written; empty where nothing
-    is.
-    """
+    """Failures of stopping and starting a daemon on a disk that cannot be written; empty if none."""
     code = bench.daemon.stop()
     wrong = [f"the daemon ended with exit code {code}"] if code else []
     wrong.append(unexpected(bench))
@@ -173,7 +172,7 @@ def starts_again(bench: ServiceBench) -> str:
 
 
 def unexpected(bench: ServiceBench) -> str:
-    """Lines of the daemon's log that no disk is a reason for: a process that ended, a traceback; empty without."""
+    """Lines of the daemon's log not explained by the disk: a process that ended, a traceback; empty if none."""
     words = ("Traceback", "starting again", "Error")
     return "; ".join(line for line in bench.daemon.output().splitlines() if any(word in line for word in words))
 
@@ -181,36 +180,36 @@ def unexpected(bench: ServiceBench) -> str:
 # -- trials ----------------------------------------------------------------------------------------------------
 
 SLOW = 0.03
-"""Share of its speed at which the arm moves for longer than a daemon takes to start."""
+"""Speed scale at which the arm moves for longer than a daemon takes to start."""
 RAMP_MS = 60.0
 """From that speed to rest, by the loop's ramp or the drives' own."""
 DRIVES_MS = 120.0
-"""After which drives notice a master that has gone."""
+"""Time after which drives detect the loss of their master."""
 SILENCE_MS = 800.0
-"""After which the servo process takes the gateway for gone."""
+"""Time after which the servo process considers the gateway lost."""
 JOG_LEASE_MS = 250.0
-"""Of a jog that nobody renews."""
+"""Lease of a jog that is not renewed."""
 GOAL_LEASE_MS = 1000.0
-"""Of a goal that nobody renews."""
+"""Lease of a goal that is not renewed."""
 SESSION_MS = 100.0
-"""Of a stop by a session that is open."""
+"""Time limit of a stop by an open session."""
 STOP_MS = 50.0
 COMMAND_MS = 700.0
-"""From the start of `stereoservo stop`."""
+"""Time limit from the start of `stereoservo stop`."""
 WATCHED_S = 2.0
-"""After the fault."""
+"""Time of observation after the fault."""
 ASKED_S = 1.0
-"""After the fault `status` is asked."""
+"""Time after the fault at which `status` is requested."""
 MOVING = 2e-3
-"""[rad/s] Of any joint, by the truth."""
+"""True speed of any joint above which the arm counts as moving [rad/s]."""
 STILL_NS = 50_000_000
 TRIES = 5
 STALL_S = 0.09
-"""By which a thread that only sleeps comes late on a machine that stalls, short of what the drives bear."""
+"""Lateness of a sleeping thread that indicates a stall of the machine; below the drives' time-out."""
 FASTER = 0.2
-"""Share of its speed at which the arm is at its goal some seconds after the trial."""
+"""Speed scale at which the arm reaches its goal some seconds after the trial."""
 REACHED_S = 30.0
-"""After which a goal that goes on is reached."""
+"""Time limit for a continuing goal to be reached."""
 TERMINAL = ("goal_reached", "goal_aborted", "goal_cancelled", "goal_preempted")
 JOGS = """
 import sys, time
@@ -232,15 +231,20 @@ with Client(sys.argv[1]) as client:
 
 @dataclass(frozen=True)
 class ServiceFault:
-    """What is done to the service, and what must come of it.
+    """A fault injected into the service, and its required consequences.
 
-    ``process``, ``signal``: of the daemon's, or ``client``, or an act of the bench's own by ``act``. ``bound_ms``: to
-    rest; None where the arm goes on; with ``may_go_on`` it rests by then or goes on. ``after``: what `status` may tell
-    a second later, the lifecycle or the code of its error. ``client``: the program of a client in a process of its own,
-    which moves the arm; else one of the bench does, at ``speed_scale``. ``note``: what a note in the status says once
-    the daemon is ready again; its state is forgotten then. ``disk``: what the state directory lies on while a daemon
-    runs. ``notes``: what those a second later say. ``reaches``: the goal goes on until it is reached, with the cause
-    there. ``check``: what is wrong once it is gone. ``trials_a_daemon``: after so many it is ended, 0 where it goes on.
+    ``process``, ``signal``: of the daemon's, or ``client``; or an act of the bench by ``act``. ``bound_ms``: to rest;
+    None
+    if the arm continues; with ``may_go_on`` it either rests by then or continues. ``after``: allowed results of
+    `status` a
+    second later, the lifecycle or the code of its error. ``client``: program of a separate client process that moves
+    the
+    arm; else the bench moves it at ``speed_scale``. ``note``: text in a status note once the daemon is ready again; its
+    state is then deleted. ``disk``: file system of the state directory while a daemon runs. ``notes``: texts in the
+    notes a
+    second later. ``reaches``: the goal continues until it is reached, with the cause present. ``check``: failures after
+    the
+    cause is removed. ``trials_a_daemon``: number after which the daemon is ended, 0 if it continues.
     """
 
     name: str
@@ -267,9 +271,7 @@ class ServiceFault:
 
 ACTIVE = ("active",)
 PAUSES = 3
-"""Trials in which a process ends, after which a new daemon costs no more time than the supervisor's next pauses, which
-grow to 10 s.
-"""
+"""Trials with an ended process after which a new daemon is faster than the supervisor's pauses, which grow to 10 s."""
 ENDED = ("not_running", "servo_silent")
 NOT_RECORDED = ("flight ring", "left out")
 NO_GATEWAY = ("no_reply", "session")
@@ -344,10 +346,11 @@ FAULTS = (
 def run_service(
     repetitions: int, tell: Callable[[dict[str, Any]], None], faults: tuple[ServiceFault, ...] = FAULTS
 ) -> list[dict[str, Any]]:
-    """Rows of all faults, ``repetitions`` trials each; ``tell`` gets each as it comes. A trial after which no daemon
-    answers is not within its bound; what was tried stands in the place of what `status` says.
+    """Rows of all faults, ``repetitions`` trials each; ``tell`` is called with each. A trial after which no daemon
+    answers
+    is not within its bound; the attempts are then reported in place of `status`.
 
-    Raises ExperimentError where the drives or a daemon do not come up.
+    Raises ExperimentError if the drives or a daemon do not start.
     """
     rows = []
     with service_bench.running_bench() as bench:
@@ -416,14 +419,14 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
 
 
 def _is_within(rest_ms: float | None, bound_ms: float | None, may_go_on: bool) -> bool:
-    """Whether the arm rested in time, or, without a bound, went on."""
+    """Whether the arm rested in time, or, without a bound, continued."""
     if rest_ms is None:
         return bound_ms is None or may_go_on
     return bound_ms is not None and rest_ms <= bound_ms
 
 
 def _status_is_right(trial: dict[str, Any], fault: ServiceFault) -> bool:
-    """Whether `status` a second later told what is so, with exit code 1 where that is an error, and later the note."""
+    """Whether `status` a second later was correct, with exit code 1 for an error, and later contained the note."""
     right = trial["after"] in fault.after and trial["code"] == (0 if trial["after"] == "active" else 1)
     right = right and all(any(text in note for note in trial["now"]) for text in fault.notes)
     return right and (not fault.note or any(fault.note in note for note in trial["notes"]))
@@ -494,13 +497,13 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
 
 
 def _refuse_reached(events: list[EventMessage], when: str) -> None:
-    """Raise VoidTrialError where a goal was reached: the arm rests for that."""
+    """Raise VoidTrialError if a goal was reached: the arm then rests for that reason."""
     if any(event.kind == "goal_reached" for event in events):
         raise VoidTrialError(f"the goal was reached {when}")
 
 
 def _not_reached(events: list[EventMessage]) -> str:
-    """What is wrong with the goal's end, for which it waits; empty where it is reached."""
+    """Wait for the goal's end; returns what is wrong with it, empty if it was reached."""
     until = time.monotonic() + REACHED_S
     while not (ends := [event for event in events if event.kind in TERMINAL]):
         if time.monotonic() > until:
@@ -510,7 +513,7 @@ def _not_reached(events: list[EventMessage]) -> str:
 
 
 def _sent_goal(client: Client, child: subprocess.Popen[str] | None, speed_scale: float) -> str:
-    """The id of a goal that this process's client sends, or that of the child's. Raises VoidTrialError."""
+    """Id of a goal sent by this process's client, or by the child. Raises VoidTrialError."""
     if child is not None:
         assert child.stdout is not None
         if not (line := child.stdout.readline()):
@@ -530,8 +533,8 @@ def _reasons(status: dict[str, Any]) -> str:
 def _afterwards(
     bench: ServiceBench, fault: ServiceFault, told_live: list[EventMessage]
 ) -> tuple[tuple[int, ...], tuple[str, ...]]:
-    """How many terminal events of each goal are told in the end, to who listened, by this daemon or the next; and the
-    notes of the daemon that is ready again.
+    """Number of terminal events of each goal, received by listeners from this daemon or the next; and the notes of the
+    daemon that is ready again.
     """
     bench.ready()
 
@@ -562,7 +565,9 @@ def _await_motion(history: TrueJointHistory) -> None:
 
 
 def _rest_ms(history: TrueJointHistory, start: int, t0_ns: int) -> float | None:
-    """From ``t0_ns`` to the last motion [ms] within the time that is watched; None where the arm still moves then."""
+    """Time from ``t0_ns`` to the last motion [ms] within the time of observation; None if the arm still moves at its
+    end.
+    """
     end_ns = t0_ns + round(WATCHED_S * 1e9)
     last_ns = newest_ns = t0_ns
     for index in range(start, history.count):

@@ -33,21 +33,23 @@ from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedNode
 
 
 MASTER = 0
-"""The sender that is not a node of the emulated bus; nodes are 1, 2, ... in their order."""
+"""Sender number of the master; the nodes of the emulated bus are 1, 2, ... in their order."""
 QUEUE_LIMIT = 2000
-"""Frames that a sender may have waiting; further ones are lost, as from a full transmit buffer."""
+"""Largest number of frames in a sender's queue; further ones are lost, as from a full transmit buffer."""
 SECOND_NS = 1_000_000_000
 COB_IDS = {
     "emcy": 0x080, "tpdo1": 0x180, "tpdo2": 0x280, "tpdo3": 0x380, "tpdo4": 0x480, "sdo": 0x580, "heartbeat": 0x700,
 }  # fmt: skip
-"""Frames of a node by name: the base of their id in the predefined connection set (CiA 301, 7.3.5)."""
+"""Frames of a node by name: base of their id in the predefined connection set (CiA 301, 7.3.5)."""
 SYNC_ID = 0x080
 
 
 def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
-    """Bits of the arbitration field in the order of sending, dominant as 0: the smallest wins.
+    """Bits of the arbitration field in the order of transmission, dominant as 0: the smallest wins.
 
-    A data frame so goes before the remote frame of its id, and a standard one before an extended one that begins alike.
+    So a data frame wins against the remote frame of the same id, and a standard frame against an extended one that
+    begins
+    alike.
     """
     if frame.extended:
         return frame.id >> 18, 1, 1, frame.id & 0x3FFFF, int(frame.remote)
@@ -58,7 +60,7 @@ class Wire:
     """The wire, one frame at a time. Each sender's frames keep their order; between senders, arbitration decides.
 
     ``bitrate`` [bit/s]; None: frames take no time. A frame occupies its stuffed bits and the intermission and arrives
-    when those are over. Bit errors, and the collision of two frames with one id, are not modelled: both go out.
+    at the end of these. Bit errors, and the collision of two frames with one id, are not modelled: both are sent.
     """
 
     def __init__(self, bitrate: int | None) -> None:
@@ -67,10 +69,10 @@ class Wire:
         self.lost = 0
         self.busy_ns = 0
         self.end_ns = NEVER_NS
-        """When the frame on the wire ends."""
+        """Time at which the frame on the wire ends."""
         self._queues: dict[int, deque[CanFrame]] = {}
         self._heads: list[tuple[tuple[int, int, int, int, int], int]] = []
-        """Every sender's first waiting frame, by its arbitration field: a heap."""
+        """Every sender's first queued frame, by its arbitration field: a heap."""
         self._sending: tuple[int, CanFrame] | None = None
 
     def send(self, sender: int, frame: CanFrame) -> None:
@@ -87,7 +89,7 @@ class Wire:
         heapq.heappush(self._heads, (arbitration_key(frame), sender))
 
     def waiting(self, sender: int) -> int:
-        """Frames of ``sender`` that are not on the wire yet."""
+        """Number of queued frames of ``sender``, without the one on the wire."""
         return len(self._queues.get(sender, ()))
 
     def start(self, t_ns: int) -> None:
@@ -106,7 +108,7 @@ class Wire:
 
     def finish(self) -> tuple[int, CanFrame]:
         """End the frame on the wire; returns its sender and the frame."""
-        assert self._sending is not None  # end_ns is NEVER_NS otherwise
+        assert self._sending is not None  # otherwise end_ns is NEVER_NS
         ended = self._sending
         self._sending = None
         self.end_ns = NEVER_NS
@@ -150,7 +152,7 @@ class Disturbances:
         return not (self.drop_sync and frame.id == SYNC_ID and not frame.extended)
 
     def words(self, node_id: int) -> str:
-        """Disturbances of a node, as text."""
+        """Disturbances of a node as text."""
         parts = []
         if node_id in self.cut or not self.master_connected:
             parts.append("cable out")
@@ -164,22 +166,24 @@ class Disturbances:
 
 
 BABBLE = 20_000
-"""Sender of a babbling node's babble is this plus its number."""
+"""A babbling node sends its babble as this sender number plus its own."""
 BABBLE_FRAME = CanFrame(0x17F, bytes(8))
 EVENTS_KEPT = 100_000
 STUCK = 10_000
-"""Events at one instant without end: a node that asks for time that is past, or two that answer each other."""
+"""Number of events at one instant at which the emulation stops: a node's due time stays past, or two nodes answer
+each other endlessly.
+"""
 
 
 class BusEmulatorError(Exception):
-    """The emulation cannot continue: a node is defective, which the text names."""
+    """The emulation cannot continue since a node is defective; the text names the node."""
 
 
 class BusEvent(msgspec.Struct, frozen=True):
-    """Something that happened on the bus at ``t_ns``.
+    """An event on the bus at ``t_ns``.
 
     ``kind``: ``order``, ``ended``, ``state``, ``power_on``, ``power_off``, ``moves``, ``rest``, ``all_rest``.
-    ``node``: 0 is all.
+    ``node``: 0 means all.
     """
 
     t_ns: int
@@ -188,11 +192,11 @@ class BusEvent(msgspec.Struct, frozen=True):
     text: str = ""
 
     def place(self) -> dict[str, int]:
-        """The node, as data."""
+        """The node as data."""
         return {"node": self.node}
 
     def where(self) -> str:
-        """The node, as text."""
+        """The node as text."""
         return f"node {self.node}" if self.node else ""
 
 
@@ -213,9 +217,12 @@ class Slot:
 class BusEmulator:
     """Emulated nodes, wire and plant in bus time [ns].
 
-    ``plant`` moves the nodes' axes, in their order. ``bitrate`` [bit/s]: frames take their time; None: none.
-    What happens at one instant happens in a fixed order (the wire, held-back frames, nodes by their place, the plant),
-    so that the same calls give the same frames. ``on_adapter`` is told when the adapter is unplugged (False) or back.
+    ``plant`` moves the nodes' axes, in their order. ``bitrate`` [bit/s]: of the wire; None: frames take no time.
+    Events at the same instant are processed in a fixed order (the wire, delayed frames, nodes in their order, the
+    plant),
+    so that the same calls give the same frames. ``on_adapter`` is called when the adapter is unplugged (False) or
+    plugged
+    in again (True).
     """
 
     def __init__(
@@ -253,7 +260,7 @@ class BusEmulator:
         return tuple(slot.node for slot in self.slots)
 
     def inject(self, frame: CanFrame, t_ns: int) -> None:
-        """Queue ``frame`` of the master at ``t_ns`` (not before the time already run)."""
+        """Queue ``frame`` of the master at ``t_ns`` (not before the bus time already reached)."""
         self.run_until(t_ns)
         if not self.disturbances.master_passes(frame):
             return
@@ -285,7 +292,7 @@ class BusEmulator:
         return due
 
     def delivered(self) -> list[tuple[int, CanFrame]]:
-        """Frames that reached the master since the last call, with the times of their ends."""
+        """Frames that reached the master since the last call, with their end times."""
         frames, self._delivered = self._delivered, []
         return frames
 
@@ -324,7 +331,7 @@ class BusEmulator:
         raise FaultCommandError(f"no node {node_id} on this bus; nodes: {there}")
 
     def add(self, node: EmulatedNode, *, boots: bool) -> None:
-        """Add a node to the bus, whose axis moves nothing."""
+        """Add a node to the bus; its axis is not connected to the plant."""
         if boots:
             node.power_up(self.t_ns)
         slot = Slot(node, self._next_index(), None)
@@ -339,7 +346,7 @@ class BusEmulator:
         return self.plant.at_rest()
 
     def power_off(self, t_ns: int) -> None:
-        """Switch off the supply of all drives: they are silent, and brakes and friction stop the arm."""
+        """Switch off the supply of all drives: they stop sending, and brakes and friction stop the arm."""
         self.run_until(t_ns)
         self.disturbances.master_connected = False
         for slot in self.slots:
@@ -413,7 +420,7 @@ class BusEmulator:
     def look(self, slot: Slot, keep: int = -1) -> list[CanFrame]:
         """Collect a node's frames to send, its next due time, and its state changes.
 
-        Frames of id ``keep`` are given back instead of sent.
+        Frames of id ``keep`` are returned instead of sent.
         """
         kept = []
         for frame in slot.node.outgoing():
@@ -481,12 +488,12 @@ FOREIGN = 10_000
 GENERIC_ERROR = 0x01
 """Bit 0 of the error register (0x1001)."""
 REMAPPING = ((0x1800, 1, None), (0x1A00, 0, 0), (0x1A00, 1, 0x60410010), (0x1A00, 0, 1), (0x1800, 1, None))
-"""SDO writes that leave the status word alone in TPDO 1: off (None: the PDO's COB-ID), mapping, on."""
+"""SDO writes that map only the status word to TPDO 1: off (None: the PDO's COB-ID), mapping, on."""
 
 
 class BusCommand(FaultCommand, frozen=True):
-    """One fault command. ``node``: 0 is the whole bus. ``number``: an error code, a count, an NMT command, by the
-    verb.
+    """One fault command. ``node``: 0 is the whole bus. ``number``: depends on the verb: an error code, a count, an NMT
+    command.
     """
 
     node: int = 0
@@ -556,7 +563,7 @@ def _check_emergency(command: BusCommand) -> None:
 
 
 def _cable_words(words: list[str]) -> dict[str, Any]:
-    """Parse arguments whose node may be left out, before the required word."""
+    """Parse arguments whose node may be omitted, before the required word."""
     fields = _node(words[0]) if words and words[0] not in IN_OR_OUT else {}
     rest = words[len(fields) :]
     at_most(rest, 1)
@@ -652,7 +659,7 @@ def _duplicate(emulator: BusEmulator, command: BusCommand) -> str:
     if command.what == "off":
         emulator.remove(doubles)
         return f"node {command.node}: {len(doubles)} doubles removed"
-    # A copy has the state of its original; one that boots forgets it.
+    # A copy starts with the state of its original; booting clears it.
     emulator.add(copy.deepcopy(emulator.slot(command.node).node), boots=command.what == "boots")
     return f"node {command.node}: a second one {'boots' if command.what == 'boots' else 'runs beside it'}"
 

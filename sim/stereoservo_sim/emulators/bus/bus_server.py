@@ -26,19 +26,22 @@ from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator, BusEvent
 from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
 SPIN_NS = 100_000
-"""With bit times the last bit before an event is not slept through: a sleep ends some 60 µs late."""
+"""Before an event the loop polls for this time instead of sleeping, since a sleep ends some 60 µs late; with bit times
+only.
+"""
 ASKING_NS = 200_000
-"""How often an endpoint is asked that cannot be waited for."""
+"""Polling period of an endpoint without a descriptor."""
 STALL_NS = 2_000_000
-"""A loop that wakes later than this was stalled."""
+"""Lateness of the loop that counts as a stall."""
 LATE_FRAME_NS = 500_000
 ENDING_NS = 500_000_000
 """Time limit after power off until the arm must be at rest."""
 
 
 class Stalls(msgspec.Struct):
-    """Lateness of the serving loop: the largest lateness and gap, how often it was later than STALL_NS, and how
-    many frames left more than LATE_FRAME_NS after their end on the bus.
+    """Lateness of the serving loop: the largest lateness and gap, number of stalls (over STALL_NS), and number of
+    frames
+    that left more than LATE_FRAME_NS after their end on the bus.
     """
 
     turns: int = 0
@@ -70,8 +73,8 @@ class _Request:
 class BusServer:
     """Serves the emulated bus ``emulator`` at ``endpoint`` until terminated.
 
-    ``on_event`` gets every event of the emulated bus, in the serving thread. ``run`` serves in the calling
-    thread; as a context manager the server runs in a thread of its own, and what failed there is raised at the end.
+    ``on_event`` is called with every event of the emulated bus, in the serving thread. ``run`` serves in the calling
+    thread. As a context manager the server runs in its own thread, and an exception there is raised at the end.
     """
 
     def __init__(
@@ -105,7 +108,7 @@ class BusServer:
 
     @property
     def channel(self) -> str:
-        """Channel by which a master connects to the drives."""
+        """Channel at which a master connects to the drives."""
         return self.endpoint.channel
 
     def watch(self, descriptor: int, act: Callable[[], None]) -> None:
@@ -165,7 +168,7 @@ class BusServer:
                 request.done.set()
 
     def turn(self) -> None:
-        """Wait for the next event or input, and advance the bus to the present."""
+        """Wait for the next event or input, and advance the bus to the current time."""
         descriptors = self.endpoint.descriptors()
         wanted = self.emulator.due_ns()
         if not descriptors:
@@ -186,18 +189,17 @@ class BusServer:
         self._turned_ns = now
 
     def _sleep(self, descriptors: list[int], until_ns: int) -> list[int]:
-        """Wait for input or for ``until_ns``; returns what is readable. With bit times the end is waited for by
-        polling.
+        """Wait for input or until ``until_ns``; returns the readable descriptors. With bit times the last part is
+        polled.
         """
         spin = SPIN_NS if self.emulator.wire.bitrate is not None else 0
         left_ns = until_ns - self._clock_ns() - spin
         return select.select(descriptors, [], [], max(left_ns, 0) * 1e-9)[0]
 
     def _stamped(self, frames: list[CanFrame], wanted: int, now: int) -> list[tuple[int, CanFrame]]:
-        """Send times of the master's frames: now; those that arrived while the loop was stalled are spread evenly
-        over that time.
+        """Send times of the master's frames: now; frames that arrived during a stall are spread evenly over it.
 
-        Otherwise the drives would watch their time-outs run off before they hear what had come in time.
+        Otherwise the drives' time-outs would expire before frames that were in time are processed.
         """
         if now - wanted < STALL_NS:
             return [(now, frame) for frame in frames]
@@ -253,7 +255,7 @@ class BusServer:
     def _serve(self) -> None:
         try:
             self.run(self._ended.is_set)
-        except BaseException as error:  # shown by __exit__: a thread has nobody to raise to
+        except BaseException as error:  # raised by __exit__
             self._failure = error
 
     def __exit__(
@@ -292,7 +294,7 @@ def open_endpoint(channel: str, bus_bitrate: int) -> Endpoint:
 
 
 def served_channel(options: CanOptions) -> str:
-    """The channel at which a cell's master expects its drives. Raises EndpointError where it cannot be served."""
+    """The channel at which a cell's master expects its drives. Raises EndpointError if it cannot be served."""
     channel = str(options.channel)
     if channel.startswith("socket://"):
         return channel
@@ -311,10 +313,10 @@ def served_channel(options: CanOptions) -> str:
 
 READ_SIZE = 65_536
 BACKLOG_LIMIT = 1 << 20
-"""Bytes that a client may leave unread; what comes then is lost, as in an adapter whose buffer is full."""
+"""Unread bytes that are kept for a client; further ones are lost, as in an adapter whose buffer is full."""
 DATA_OVERRUN = 0x08
 WRONG_BITRATE = 0x80 | 0x20 | 0x04
-"""Bus error, error passive, error warning: what an adapter at another bit rate than the bus ends in."""
+"""Bus error, error passive, error warning: final state of an adapter whose bit rate differs from the bus's."""
 
 
 class EndpointError(Exception):
@@ -324,7 +326,7 @@ class EndpointError(Exception):
 class Endpoint(Protocol):
     """Protocol of the master's side of the bus.
 
-    ``channel``: how a master reaches it. ``descriptors``: what to wait for; empty where it has to be asked.
+    ``channel``: address at which a master connects. ``descriptors``: to wait for; empty if it must be polled.
     """
 
     channel: str
@@ -334,11 +336,11 @@ class Endpoint(Protocol):
         ...
 
     def take(self) -> list[CanFrame]:
-        """Frames that the master sent; never waits."""
+        """Frames that the master sent; does not block."""
         ...
 
     def give(self, frames: list[tuple[int, CanFrame]]) -> None:
-        """Frames for the master with their bus times [ns]; never waits."""
+        """Send frames to the master, with their bus times [ns]; does not block."""
         ...
 
     def plug(self, plugged: bool) -> None:
@@ -361,12 +363,12 @@ class _SerialClient:
 
     @property
     def deaf(self) -> bool:
-        """Whether the host set another bit rate than the bus has."""
+        """Whether the host has set another bit rate than the bus's."""
         rate = self.adapter.bitrate
         return self.adapter.registers is not None or (rate is not None and rate != self._bitrate)
 
     def take(self) -> list[CanFrame]:
-        """Frames of the host. Raises OSError where it is gone."""
+        """Frames of the host. Raises OSError if it is disconnected."""
         try:
             chunk = os.read(self.descriptor, READ_SIZE)
         except BlockingIOError:
@@ -376,7 +378,7 @@ class _SerialClient:
         was_open = self.adapter.is_open
         frames, answer = self.adapter.feed(chunk)
         if was_open and not self.adapter.is_open:
-            self._unsent = b""  # frames of a channel that is closed
+            self._unsent = b""  # frames of a closed channel
         if frames and self.deaf:
             self.adapter.flags |= WRONG_BITRATE
             frames = []
@@ -384,7 +386,7 @@ class _SerialClient:
         return frames
 
     def give(self, frames: list[tuple[int, CanFrame]]) -> None:
-        """Frames for the host. Raises OSError where it is gone."""
+        """Send frames to the host. Raises OSError if it is disconnected."""
         if not self.adapter.is_open:
             return
         if self.deaf:
@@ -393,7 +395,7 @@ class _SerialClient:
         self.write(self.adapter.deliver([frame for _, frame in frames], frames[-1][0]))
 
     def write(self, data: bytes) -> None:
-        """Write as much as the host takes now."""
+        """Write as much as the host accepts now."""
         self._unsent += data
         if not self._unsent:
             return
@@ -433,7 +435,7 @@ class SlcanTcp:
         self._listener = listener
 
     def descriptors(self) -> list[int]:
-        """The listener's and the client's."""
+        """Descriptors of the listener and of the client."""
         return [end.fileno() for end in (self._listener, self._client) if end is not None]
 
     def take(self) -> list[CanFrame]:
@@ -452,7 +454,7 @@ class SlcanTcp:
             return []
 
     def give(self, frames: list[tuple[int, CanFrame]]) -> None:
-        """Frames for the client, if there is one; they are lost otherwise."""
+        """Send frames to the client, if there is one; otherwise they are lost."""
         if self._line is None:
             return
         try:
@@ -471,7 +473,7 @@ class SlcanTcp:
                 self._listener = None
 
     def close(self) -> None:
-        """Close the connection; nobody listens any more."""
+        """Close the connection and the listener."""
         self.plug(False)
 
     def _accept(self, frames: list[CanFrame]) -> None:
@@ -481,7 +483,7 @@ class SlcanTcp:
             client, _ = self._listener.accept()
         except BlockingIOError:
             return
-        # Whoever closes a connection may open the next at once: what the old one still says comes first.
+        # A client that closes a connection may open the next at once: the old one's last data are processed first.
         while self._client is not None and select.select([self._client], [], [], 0)[0]:
             frames += self._read()
         if self._client is not None:
@@ -517,11 +519,11 @@ class SlcanPty:
         return [self._ours] if self._ours >= 0 else []
 
     def take(self) -> list[CanFrame]:
-        """What was written to the terminal. Our own open end keeps it alive between masters."""
+        """Bytes written to the terminal. Our own open end keeps it alive between masters."""
         return self._line.take() if self._ours >= 0 else []
 
     def give(self, frames: list[tuple[int, CanFrame]]) -> None:
-        """Frames for whoever reads the terminal."""
+        """Send frames to the reader of the terminal."""
         if self._ours >= 0:
             self._line.give(frames)
 
@@ -549,14 +551,14 @@ class PythonCanEndpoint:
         self._error = can.CanError
         try:
             self._bus = can.Bus(interface=interface, channel=channel, **options)
-        except Exception as error:  # interfaces without their maker's library raise anything
+        except Exception as error:  # interfaces whose vendor library is missing raise anything
             what = str(error) or type(error).__name__
             raise EndpointError(f"python-can cannot open {self.channel}: {what}") from error
         self._plugged = True
         self.lost = 0
 
     def descriptors(self) -> list[int]:
-        """Descriptor of the bus, where it has one."""
+        """Descriptor of the bus, if it has one."""
         try:
             descriptor = self._bus.fileno()
         except NotImplementedError:

@@ -33,18 +33,20 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 SHIPPED_EDS = Path(stereoservo_drivers.canopen.__file__).parent / "drive402.eds"
 DEFAULT_RATED_TORQUE = 100.0
-"""[N m] of a joint of the simulated arm for which neither the driver's options nor ``[emulate.drives]`` say it."""
+"""[N m] of a joint of the simulated arm if neither the driver's options nor ``[emulate.drives]`` state it."""
 
 
 class DrivesSettings(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Section ``[emulate.drives]`` of a cell file, with the options on which arm it is and where (`ArmPlace`).
+    """Section ``[emulate.drives]`` of a cell file, with the options on the arm and its pose (`ArmPlace`).
 
     ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
-    mass. ``bit_time``: frames take their time on the wire. ``start``: positions by joint [rad or m] of an arm that was
-    never moved; ``resume``: an arm whose truth file exists starts at its end. ``brake_ms``: what the brakes take
-    to open and to close. ``rated_torques`` by joint [N m or N] where they are not the driver's. ``eds``: of the
-    emulated drives where it is not the driver's, relative to the cell file. ``machine``: see PlantSettings.
-    ``mechanics``: a preset, or what is not perfect by joint, see `stereoservo_sim.world.mechanics`; encoders have the
+    mass. ``bit_time``: frames take their time on the wire. ``start``: initial positions by joint [rad or m];
+    ``resume``: if the arm's truth file exists, start at its last positions. ``brake_ms``: time the brakes take to open
+    and
+    to close. ``rated_torques`` by joint [N m or N] if they differ from the driver's. ``eds``: of the emulated drives if
+    it
+    differs from the driver's, relative to the cell file. ``machine``: see PlantSettings.
+    ``mechanics``: a preset, or imperfections by joint, see `stereoservo_sim.world.mechanics`; encoders have the
     driver's counts.
     """
 
@@ -92,8 +94,8 @@ def make_bus_emulator(
 ) -> BusEmulator:
     """The emulated drives of ``options``, switched on at ``t_ns``.
 
-    ``runtime_dir``: where the arm's truth is written; None: nowhere. ``cell_dir``: what an EDS or URDF is
-    relative to. ``mount``: of the cell's cameras. Raises EmulationError.
+    ``runtime_dir``: folder of the arm's truth file; None: it is not written. ``cell_dir``: folder to which paths of EDS
+    and URDF are relative. ``mount``: of the cell's cameras. Raises EmulationError.
     """
     settings = settings or DrivesSettings()
     names = [joint.name for joint in options.joint]
@@ -108,7 +110,7 @@ def make_bus_emulator(
     positions = newest[1] if newest is not None else start
     plant, rated = _plant(options, settings, positions, arm)
     grippers = tuple(gripper.joint() for gripper in options.gripper)
-    if grippers:  # each begins open
+    if grippers:  # all start open
         plant = PlantBeside(plant, IdealPlant(np.array([joint.position_max for joint in grippers])))
         rated = None if rated is None else [*rated, *([1.0] * len(grippers))]
     drives = (*options.joint, *grippers)
@@ -147,7 +149,7 @@ def _node(
 
 
 def _arm(options: CanOptions, settings: DrivesSettings, mount: Mount, cell_dir: Path) -> SimulatedCell | None:
-    """The simulated cell of the arm that the drives move; None where it is of other joints, without mass."""
+    """The simulated cell of the arm that the drives move; None for massless joints of other names."""
     if settings.plant == "ideal" and not settings.urdf:
         return None
     try:
@@ -169,7 +171,7 @@ def _arm(options: CanOptions, settings: DrivesSettings, mount: Mount, cell_dir: 
 
 
 def _start(options: CanOptions, settings: DrivesSettings, arm: SimulatedCell | None) -> FloatArray:
-    """Initial joint positions: as configured, else the simulated cell's base, else mid-range."""
+    """Initial joint positions: as configured, else those of the simulated cell's base, else mid-range."""
     positions = np.array([min(max(0.0, joint.position_min), joint.position_max) for joint in options.joint])
     if arm is not None:
         positions = arm.base.copy()
@@ -187,7 +189,7 @@ def _start(options: CanOptions, settings: DrivesSettings, arm: SimulatedCell | N
 def _plant(
     options: CanOptions, settings: DrivesSettings, positions: FloatArray, arm: SimulatedCell | None
 ) -> tuple[Plant, list[float] | None]:
-    """The plant, and the rated torques that its efforts are shares of."""
+    """The plant, and the rated torques to which its efforts are relative."""
     names = tuple(joint.name for joint in options.joint)
     try:
         mechanics = chosen_mechanics(settings.mechanics, names, [joint.kind == "prismatic" for joint in options.joint])
@@ -199,7 +201,7 @@ def _plant(
         return ideal if mechanics is None else MechanicalPlant(ideal, mechanics, robot), None
     from stereoservo_sim.world.physics import PhysicsError, PybulletPlant
 
-    assert arm is not None  # of plant "pybullet"
+    assert arm is not None  # plant "pybullet" has an arm
     robot = arm.robot
     ratings: Mapping[str, Any] = settings.rated_torques
     rated = [float(ratings.get(joint.name) or joint.rated_torque or DEFAULT_RATED_TORQUE) for joint in options.joint]

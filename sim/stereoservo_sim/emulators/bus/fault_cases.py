@@ -13,14 +13,15 @@ Stage = Literal["running", "standing", "start", "reset"]
 class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
     """One fault case of the table.
 
-    ``orders``: given to the emulated bus at the moment of the fault (``stage`` running), when the arm is
-    enabled and about to move (standing; times count from its first command), before bring-up (start), or a fault
-    whose reset is then tried (reset). ``host``: what becomes of the master's computer at that moment. ``codes``: what
-    the master may latch first or bring-up may refuse with, one or several by the fault's phase; empty: nothing
-    latches, motion goes on. ``bound_ms``: from the fault to all axes at rest. ``by``: who ends motion.
-    ``afterwards``: ordered once the axes rest: the cause goes away, and nothing may move again by itself.
-    ``options``: what the cell's options have differently. ``warm_s``: motion before the fault. ``towards``: the node
-    that has to move in its positive direction; 0: none.
+    ``stage``: when the fault occurs: running; when the arm is enabled and about to move (standing; times count from its
+    first command); before bring-up (start); or a fault whose reset is then tried (reset). ``orders``: commands for the
+    emulated bus at that moment. ``host``: what happens to the master's computer then. ``codes``: what the master may
+    latch
+    first, or bring-up may refuse with, one or several by the fault's phase; empty: nothing latches, motion continues.
+    ``bound_ms``: from the fault to all axes at rest. ``by``: the side that ends motion. ``afterwards``: ordered once
+    the
+    axes rest: it removes the cause, and nothing may move again by itself. ``options``: changes of the cell's options.
+    ``warm_s``: motion before the fault. ``towards``: the node that has to move in its positive direction; 0: none.
     """
 
     name: str
@@ -37,9 +38,9 @@ class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
 
 
 AFTER_A_HANG = ("emergency", "left_operational", "drive_fault", "disabled", "bus_silent")
-"""What a thread may find first that goes on after the drives have stopped by themselves."""
+"""Codes that a thread may find first when it continues after the drives have stopped by themselves."""
 NO_DEADLINE = {"rpdo_deadline_ms": 0}
-"""The drives' deadline for commands off: their watch on the master's heartbeat (0x1016) acts alone."""
+"""The drives' deadline for commands is off: their heartbeat monitor (0x1016) of the master acts alone."""
 
 EITHER_PROTOCOL = (
     FaultCase(
@@ -90,7 +91,7 @@ EITHER_PROTOCOL = (
     ),
     FaultCase(name="servo loop hangs", host="loop_hangs", codes=("loop_hung",), bound_ms=150),
 )
-"""What looks the same to drives of both protocols."""
+"""Cases that are the same for drives of both protocols."""
 
 CIA402_CASES = (
     *EITHER_PROTOCOL,
@@ -236,7 +237,7 @@ CIA402_CASES = (
         stage="reset",
     ),
 )
-"""Of six CiA 402 drives at 250 Hz with ramps of 12.5 ms."""
+"""Cases of six CiA 402 drives at 250 Hz with ramps of 12.5 ms."""
 
 ODRIVE_CASES = (
     *EITHER_PROTOCOL,
@@ -278,7 +279,7 @@ ODRIVE_CASES = (
         stage="reset",
     ),
 )
-"""Of six ODrives whose watchdogs are set to 100 ms."""
+"""Cases of six ODrives whose watchdogs are set to 100 ms."""
 
 CASES: dict[str, tuple[FaultCase, ...]] = {"cia402": CIA402_CASES, "odrive": ODRIVE_CASES}
-"""By protocol."""
+"""Cases by protocol."""

@@ -17,8 +17,8 @@ from stereoservo_sim.emulators.bus.fault_trials import RATE_HZ, Trial, run_trial
 class FaultRow(msgspec.Struct, frozen=True):
     """Summary of one fault over several trials.
 
-    Times [ms] after the fault. ``detected_cycles``: largest, in cycles of the master. ``codes``: what was latched
-    first, how often. ``restarts``: trials in which something moved or was powered again by itself.
+    Times [ms] after the fault. ``detected_cycles``: largest, in cycles of the master. ``codes``: count of each code
+    latched first. ``restarts``: trials in which something moved or was powered again by itself.
     """
 
     protocol: str
@@ -52,9 +52,7 @@ def run_row(case: FaultCase, protocol: str, trials: int, seed: int, *, run_on_s:
 
 
 def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
-    """Row of a fault's trials. For faults that only the drives detect, a later latch of the master is not a
-    detection.
-    """
+    """Row of a fault's trials. If only the drives detect a fault, a later latch of the master is no detection."""
     seen = [] if case.host in ("killed", "cycle_hangs") else [trial.detected_ms for trial in trials]
     detected_median, detected_max = _median_and_max(seen)
     rest_median, rest_max = _median_and_max([trial.rest_ms for trial in trials])
@@ -78,7 +76,7 @@ def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
 
 
 def _median_and_max(values: Sequence[float | None]) -> tuple[float | None, float | None]:
-    """Median and maximum of the values that are not None, to 0.01; None where there are none."""
+    """Median and maximum of the values that are not None, to 0.01; None if there are none."""
     there = [value for value in values if value is not None]
     if not there:
         return None, None

@@ -1,8 +1,8 @@
 """Fault trials of the CAN arm in virtual time: the driver's master on the emulated bus, bit times included.
 
-Each trial drives six axes at a steady speed, makes one fault happen at a random phase of the cycle, and looks at the
-axes' true velocities: when the master knew, when all axes stood, what was latched, whether anything moved or
-was powered again by itself afterwards.
+Each trial drives six axes at constant speed, injects one fault at a random phase of the cycle, and evaluates the axes'
+true velocities: when the master detected it, when all axes were at rest, what was latched, and whether anything moved
+or was powered again by itself afterwards.
 """
 
 from __future__ import annotations
@@ -31,20 +31,20 @@ COUNTS_PER_REV = 4096.0
 GEAR_RATIO = 100.0
 SPEED_COUNTS_S = 50_000.0
 RAMP_COUNTS_S2 = 4e6
-"""From ``SPEED_COUNTS_S`` to rest in 12.5 ms."""
+"""Ramp from ``SPEED_COUNTS_S`` to rest in 12.5 ms."""
 BOOT_S = 1.5
-"""Time that the drives get to boot before bring-up."""
+"""Time for the drives to boot before bring-up."""
 ENABLE_S = 1.0
 SETTLE_S = 0.1
-"""After the fault, at least: in this time the axes must come to rest, and what is tolerated must not latch."""
+"""Least time after the fault in which the axes must come to rest and tolerated events must not latch."""
 
 
 class Trial(msgspec.Struct, frozen=True):
     """Result of one fault trial. Times after the fault [ms]; None: not detected, or never at rest.
 
-    ``code``: what was latched first, or why bring-up refused. ``restarted``: something moved or was powered
-    again by itself. ``problem``: what went otherwise than the table says, or that reset and enable did not bring
-    the arm back (of a cause that stays: that they did); empty: nothing.
+    ``code``: the first latched, or why bring-up refused. ``restarted``: something moved or was powered again by itself.
+    ``problem``: deviation from the table, or that reset and enable did not restore motion (for a persistent cause: that
+    they did); empty: none.
     """
 
     detected_ms: float | None
@@ -59,7 +59,7 @@ class TrialError(Exception):
 
 
 def trial_options(protocol: str, **changes: object) -> CanOptions:
-    """Options of six joints of the table's speed and ramps."""
+    """Options of six joints with the table's speed and ramps."""
     odrive = protocol == "odrive"
     counts_per_rad = COUNTS_PER_REV * GEAR_RATIO / (2.0 * math.pi)
     ramp = RAMP_COUNTS_S2 / counts_per_rad
@@ -157,7 +157,9 @@ def run_trial(
     run_on_s: float = 1.0,
     rig: Callable[[FaultCase, str], FaultRig] = FaultRig,
 ) -> Trial:
-    """One trial on a new ``rig``. ``run_on_s``: how long after rest nothing may move by itself. Raises TrialError."""
+    """Run one trial on a new ``rig``. ``run_on_s``: time after rest in which nothing may move by itself. Raises
+    TrialError.
+    """
     return _run(rig(case, protocol), rng, run_on_s)
 
 
@@ -202,7 +204,7 @@ def _strike(rig: FaultRig) -> None:
 
 
 def _until_rest(rig: FaultRig, t0: int) -> int | None:
-    """Run until the axes have been at rest for a while; returns when the last one stopped, None: never."""
+    """Run until the axes have been at rest for a while; returns when the last one stopped, None if never."""
     rig.host.wait(max(SETTLE_S, 2e-3 * (rig.case.bound_ms or 0.0)))
     if not rig.still():
         return None
@@ -291,9 +293,9 @@ def _tolerated(rig: FaultRig, speed: FloatArray) -> Trial:
 
 
 def _start_trial(rig: FaultRig, run_on_s: float) -> Trial:
-    """Trial of a fault that is present before bring-up: it is refused, or latched and enabling refused."""
+    """Trial of a fault present before bring-up: bring-up is refused, or it is latched and enabling is refused."""
     rig.order(rig.case.orders)
-    rig.host.wait(0.01)  # what was on the wire
+    rig.host.wait(0.01)  # frames still on the wire
     code = ""
     try:
         rig.bringup.connect(rig.host)
@@ -314,17 +316,18 @@ def _start_trial(rig: FaultRig, run_on_s: float) -> Trial:
 
 
 # -- a host in virtual time ----------------------------------------------------------------------------------
-# The master's computer in the emulated bus's virtual time: bring-up, cycle, and its failures; without threads or
+# The master's computer in the emulated bus's virtual time: bring-up, cycle, and its failures; without threads and
 # clock.
 
 
 class VirtualHost(Subscriptions):
-    """A link for bring-up and, once ``begin_cycle`` was called, the master's ticks on an absolute grid.
+    """A link for bring-up and, after ``begin_cycle``, the master's ticks on an absolute grid.
 
-    Frames are handed to the wire at the tick's time and reach the master when they end on the bus. ``velocities`` (n,)
-    is what the servo loop writes each cycle, None: it makes no call of the port.
-    ``cycling`` False: the thread of the cycle hangs, or is dead: it neither receives nor sends. What arrives meanwhile
-    waits for it.
+    Frames enter the wire at the tick's time and reach the master when they end on the bus. ``velocities`` (n,): written
+    by
+    the servo loop each cycle; None: it does not call the port. ``cycling`` False: the thread of the cycle hangs or is
+    dead,
+    and neither receives nor sends; frames that arrive meanwhile wait.
     """
 
     def __init__(self, emulator: BusEmulator, master: Master) -> None:
@@ -368,7 +371,7 @@ class VirtualHost(Subscriptions):
         self._next_ns = self.t_ns
 
     def end_cycle(self) -> None:
-        """Stop ticking, for a reset; the bus is still served."""
+        """Stop ticking, for a reset; the bus keeps running."""
         self._next_ns = None
         self._heartbeat_ns = self.t_ns
 
@@ -394,7 +397,7 @@ class VirtualHost(Subscriptions):
             self.tell(frame)
 
     def _act(self) -> None:
-        """Execute what is due at ``t_ns``: a heartbeat between the cycles, else a tick."""
+        """Execute the next event at ``t_ns``: a heartbeat between the cycles, else a tick."""
         if self._next_ns is None:
             self._heartbeat_ns = self.t_ns + self.master.settings.heartbeat_ms * 1_000_000
             self.send(self.master.codec.heartbeat())

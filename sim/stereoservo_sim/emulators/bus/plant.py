@@ -21,11 +21,11 @@ NonNegative = Annotated[float, Meta(ge=0)]
 
 STEP_NS = 1_000_000
 RECORD_STEPS = 4
-"""Every so many steps a sample of the truth is written: 250 Hz, with cubics between."""
+"""Number of steps between samples of the truth: 250 Hz, with cubic interpolation."""
 AWAKE_NS = 100_000_000
-"""How long the plant is followed at rest after power or contact has changed, for its efforts."""
+"""Time for which the plant is simulated at rest after power or contact has changed, for its efforts."""
 RESTING = 1e-3
-"""Below this [rad/s or m/s] an axis counts as at rest; simulated rigid bodies oscillate."""
+"""Speed below which an axis counts as at rest [rad/s or m/s]; simulated rigid bodies oscillate."""
 EFFORT_FILTER_S = 0.005
 
 
@@ -33,10 +33,10 @@ class PlantSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Parameters of the machine [rad, s; m for prismatic joints; efforts in shares of the rated torque].
 
     ``brake_s``: from closing until the axis is at rest. ``coast_deceleration``: of an axis without power and brake.
-    ``end_stop_margin``: how far behind the position limits the mechanical stops are. ``contact_stiffness``: effort
-    for each unit that a blocked axis lags; ``effort_max``: where the drive's current saturates. Of a plant without
-    torques of its own: ``inertia`` (effort for each unit/s²), ``friction``, ``gravity`` (times the cosine of the
-    position).
+    ``end_stop_margin``: distance of the mechanical stops beyond the position limits. ``contact_stiffness``: effort per
+    unit
+    of a blocked axis's lag; ``effort_max``: at which the drive's current saturates. For a plant without torques of its
+    own: ``inertia`` (effort per unit/s²), ``friction``, ``gravity`` (times the cosine of the position).
     """
 
     brake_s: Positive = 0.02
@@ -123,7 +123,7 @@ class _Body:
             self.velocity = 0.0
             return
         lag = self.set_position - self.position
-        # What was held up catches up at the joint's own speed, on top of what it follows.
+        # A released axis catches up at the joint's own speed, in addition to the motion that it follows.
         most = (abs(axis.set_velocity) + axis.joint.velocity_max) * h
         step = min(max(lag, -most), most)
         self.position = self.set_position if step == lag else self.position + step
@@ -145,16 +145,14 @@ class _Body:
         return self.settings.contact_stiffness * (self.set_position - self.position)
 
     def free_effort(self) -> float:
-        """Effort of inertia, friction and gravity of a joint whose plant has no torques, in shares of the rated
-        torque.
-        """
+        """Effort of inertia, friction and gravity of a joint whose plant has no torques; in rated torques."""
         s = self.settings
         moving = math.tanh(self.velocity / RESTING)
         return s.inertia * self.acceleration + s.friction * moving + s.gravity * math.cos(self.position)
 
 
 class PlantBeside:
-    """A plant and ideal joints beside it, as one: those of ``plant`` first."""
+    """A plant and ideal joints beside it, combined: the joints of ``plant`` first."""
 
     def __init__(self, plant: Plant, beside: IdealPlant) -> None:
         self._parts: tuple[Plant, Plant] = plant, beside
@@ -169,17 +167,17 @@ class PlantBeside:
 
     @property
     def motors(self) -> FloatArray:
-        """Of both."""
+        """Motor angles of both."""
         return np.concatenate([part.motors for part in self._parts])
 
     @property
     def readings(self) -> FloatArray:
-        """Of both."""
+        """Encoder angles of both."""
         return np.concatenate([part.readings for part in self._parts])
 
     @property
     def reading_rates(self) -> FloatArray:
-        """Of both."""
+        """Encoder velocities of both."""
         return np.concatenate([part.reading_rates for part in self._parts])
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
@@ -190,8 +188,8 @@ class PlantBeside:
         self._take()
 
     def rest(self, h: float) -> bool:
-        """Let ``h`` [s] pass where neither moves."""
-        first, second = (part.rest(h) for part in self._parts)  # both pass the time
+        """Let ``h`` [s] pass if neither moves."""
+        first, second = (part.rest(h) for part in self._parts)  # time passes in both
         return first and second
 
     def close(self) -> None:
@@ -201,12 +199,12 @@ class PlantBeside:
 
 
 class AxisPlant:
-    """Axes and plant, step by step. A command acts from the first grid point after it came: never too early.
+    """Axes and plant, step by step. A command acts from the first grid point after its arrival, never earlier.
 
-    A position between grid points is extrapolated with the velocity of the last one. While everything rests, steps are
-    skipped. ``history`` takes the truth. ``rated`` (n,) [N m or N]: what the plant's efforts are shares of; None: the
-    plant has no mass, and inertia, friction and gravity of the settings are used instead.
-    Without power and brake an axis coasts down by friction; that an arm then sinks under gravity is not modelled.
+    A position between grid points is extrapolated with the velocity of the last one. While everything is at rest, steps
+    are skipped. ``history`` records the truth. ``rated`` (n,) [N m or N]: torques to which the plant's efforts are
+    relative; None: the plant has no mass, and inertia, friction and gravity of the settings are used instead.
+    Without power and brake an axis coasts down by friction; sinking of an arm under gravity is not modelled.
     """
 
     def __init__(
@@ -334,5 +332,5 @@ class AxisPlant:
 
     def _record(self) -> None:
         if self._history is not None and (self.t_ns // self.step_ns) % RECORD_STEPS == 0:
-            n = self._history.joints  # a gripper is no part of the truth that cameras see
+            n = self._history.joints  # a gripper is not part of the truth that cameras see
             self._history.append(self.t_ns, self.plant.positions[:n], self.plant.velocities[:n])

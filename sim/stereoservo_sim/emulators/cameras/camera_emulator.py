@@ -31,11 +31,11 @@ from stereoservo_sim.emulators.fault_engine import (
 
 EVENTS_KEPT = 10_000
 RETRY_NS = 1_000_000
-"""How soon a shutter is looked at again that the arm's history does not reach yet."""
+"""Retry period of a shutter that the arm's history does not reach yet."""
 
 
 class CameraEvent(msgspec.Struct, frozen=True):
-    """Something that happened to a camera at ``t_ns``; ``kind``: ``order``, ``ended``, ``connected``, ``gone``."""
+    """An event of a camera at ``t_ns``; ``kind``: ``order``, ``ended``, ``connected``, ``gone``."""
 
     t_ns: int
     kind: str
@@ -43,11 +43,11 @@ class CameraEvent(msgspec.Struct, frozen=True):
     text: str = ""
 
     def place(self) -> dict[str, str]:
-        """The camera, as data."""
+        """The camera as data."""
         return {"camera": self.camera}
 
     def where(self) -> str:
-        """The camera, as text."""
+        """The camera as text."""
         return self.camera
 
 
@@ -60,9 +60,9 @@ class CameraEmulator:
         self.stalled: set[str] = set()
         self.refused: set[str] = set()
         self.wanted: set[str] = {camera.stream for camera in cameras}
-        """Streams with a client; no picture is taken for others."""
+        """Streams with a client; no images are made for others."""
         self.on_hang_up: Callable[[str, bool], None] = lambda stream, within: None
-        """Called to close a stream's connections, at once or within the next picture."""
+        """Called to close a stream's connections, at once or within the next image."""
         self._camera_lock = threading.Lock()
         self._heap_lock = threading.Lock()
         self._streams = {camera.name: camera.stream for camera in cameras}
@@ -83,10 +83,10 @@ class CameraEmulator:
         for camera in self.cameras:
             camera.close()
 
-    # -- pictures ---------------------------------------------------------------------------------------------------
+    # -- images -----------------------------------------------------------------------------------------------------
 
     def take(self, now_ns: int) -> int:
-        """Take every image that is due and requested; returns when to call again [ns]."""
+        """Make every image that is due and requested; returns when to call again [ns]."""
         due_ns = NEVER_NS
         for camera in self.cameras:
             if self._streams[camera.name] not in self.wanted:
@@ -109,7 +109,7 @@ class CameraEmulator:
         return min(picture_ns, self.faults.due_ns())
 
     def sent(self, now_ns: int) -> list[tuple[str, StreamPicture]]:
-        """Images to be sent by now, oldest first, with their streams."""
+        """Images due to be sent, oldest first, with their streams."""
         pictures = []
         with self._heap_lock:
             while self._waiting and self._waiting[0][0] <= now_ns:
@@ -127,7 +127,7 @@ class CameraEmulator:
         return self.faults.order(text, now_ns)
 
     def run_until(self, now_ns: int) -> None:
-        """Execute the fault commands whose time has come, and undo those whose time has ended."""
+        """Execute the fault commands that are due, and undo those whose time has ended."""
         while self.faults.advance(now_ns):
             pass
 
@@ -161,10 +161,10 @@ class CameraEmulator:
         marks = (("stalled", self.stalled), ("refused", self.refused))
         return "".join(f", {name}" for name, streams in marks if stream in streams)
 
-    # -- what orders do to streams ----------------------------------------------------------------------------------
+    # -- effects of fault commands on streams -------------------------------------------------------------------------
 
     def named(self, name: str) -> tuple[EmulatedCamera, ...]:
-        """The camera of that name, or ``all``. Raises FaultCommandError, which lists the cameras."""
+        """The cameras of that name, or of ``all``. Raises FaultCommandError, which lists the cameras."""
         if name == ALL:
             return self.cameras
         found = tuple(camera for camera in self.cameras if camera.name == name)
@@ -200,8 +200,9 @@ LARGEST_SIZE = 4096
 
 
 class CameraCommand(FaultCommand, frozen=True):
-    """One fault command. ``camera``: its name, or ``all``. ``number``: a count, a share, a gain, an angle [deg], by
-    the verb; ``length_m``; ``size`` (width, height); ``what``: a second word.
+    """One fault command. ``camera``: its name, or ``all``. ``number``: depends on the verb: a count, a share, a gain,
+    an
+    angle [deg]; ``length_m``; ``size`` (width, height); ``what``: a second word.
     """
 
     camera: str = ""

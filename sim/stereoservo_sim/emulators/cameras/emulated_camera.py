@@ -36,7 +36,7 @@ class StreamPicture:
 class CameraCondition:
     """Fault state of a camera. ``look``: ``black``, ``white``, ``flip``, ``mirror``, or empty.
 
-    ``gone``: its pictures are lost. ``truncate``, ``corrupt``: so many of the next JPEGs are spoilt.
+    ``gone``: its images are lost. ``truncate``, ``corrupt``: number of the next JPEGs to be damaged.
     """
 
     frozen: bool = False
@@ -70,7 +70,7 @@ class EmulatedView(PybulletCameraDriver):
 
     @property
     def phase_s(self) -> float:
-        """Delay of its shutters after those of a camera without skew."""
+        """Delay of its shutters relative to those of a camera without skew."""
         return self._options.phase_s
 
     @property
@@ -86,7 +86,7 @@ class EmulatedView(PybulletCameraDriver):
 class EmulatedCamera:
     """Camera with images of one view of the simulated cell, whose arm's history is in ``runtime_dir``.
 
-    ``services``: the arm's history in this process instead. Raises DriverError where the rig has no such view.
+    ``services``: holds the arm's history in this process instead. Raises DriverError if the rig has no such view.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class EmulatedCamera:
         return self.view.next_shutter_ns()
 
     def expose(self) -> StreamPicture | None:
-        """Image of the newest shutter, once the arm's history reaches it; None before, and for a lost one."""
+        """Image of the newest shutter, once the arm's history reaches it; None before, and for a lost image."""
         frames = self.view.poll()
         if not frames or self.condition.gone:
             return None
@@ -174,7 +174,7 @@ class EmulatedCamera:
         return image if condition.size is None else resized(image, condition.size)
 
     def _sending_ns(self, frame: Frame, rng: np.random.Generator) -> int:
-        """Sending time, which keeps the images in order whatever the jitter."""
+        """Sending time; jitter does not change the order of the images."""
         condition = self.condition
         jitter = round(condition.jitter_ns * float(rng.uniform(-1.0, 1.0)))
         self._sent_ns = max(self._sent_ns, frame.t_shutter_ns + max(condition.latency_ns + jitter, 0))
@@ -221,7 +221,7 @@ LAMP_REACH = 0.45
 CUT_SHARE = 0.5
 FLIPPED_BYTES = 40
 HEADER = 700
-"""[bytes] Of a JPEG its tables come first; flipped bytes behind them leave a picture that decodes, wrongly."""
+"""[bytes] The tables at the start of a JPEG; with bytes inverted behind them, it decodes to a wrong image."""
 
 
 def exposed(image: ImageArray, gain: float) -> ImageArray:

@@ -28,16 +28,16 @@ from stereoservo_sim.emulators.console import Console, Printer
 from stereoservo_sim.emulators.fault_engine import EmulationError
 
 SEND_BUFFER = 1 << 17
-"""[bytes] What the kernel keeps of a stream for a client that does not read: a picture or two."""
+"""[bytes] The kernel's send buffer of a stream for a client that does not read: one or two images."""
 REQUEST_NS = 5_000_000_000
 LONGEST_WAIT_S = 0.2
 LATEST_NS = 10_000_000
-"""A picture that could not be sent in time is withheld: real cameras stay punctual while this computer is busy."""
+"""Lateness at which an image is dropped: real cameras stay punctual while this computer is busy."""
 BACKLOG = 16
 
 
 class _Client:
-    """A client's connection. ``stream``: once it has requested one; ``once``: for one image of it."""
+    """A client's connection. ``stream``: set once it has requested one; ``once``: for one image of it."""
 
     def __init__(self, link: socket.socket, now_ns: int) -> None:
         self.link = link
@@ -46,16 +46,16 @@ class _Client:
         self.stream = ""
         self.once = False
         self.waiting = memoryview(b"")
-        self.hold = 0  # bytes of what waits that a stalled stream keeps back
-        self.cut = False  # it ends in the middle of its next picture
-        self.last = False  # closed when nothing waits any more
+        self.hold = 0  # bytes of the queue that a stalled stream withholds
+        self.cut = False  # ends in the middle of its next image
+        self.last = False  # closed when the queue is empty
         self.seq = -1
 
 
 class CameraServer:
     """Serves ``emulator`` at ``http://127.0.0.1:port`` (0: a free one), in the thread that calls ``run``.
 
-    ``on_event`` gets every event, in that thread. Raises EmulationError where the port is taken.
+    ``on_event`` is called with every event, in that thread. Raises EmulationError if the port is taken.
     """
 
     def __init__(self, emulator: CameraEmulator, *, cell: str = "", port: int = 0, connections: int = 32) -> None:
@@ -163,7 +163,7 @@ class CameraServer:
                 wait_s = LONGEST_WAIT_S if due_ns == NEVER_NS else (due_ns - time.monotonic_ns()) * 1e-9
                 if wait_s > 0 and self._look.wait(min(wait_s, LONGEST_WAIT_S)):
                     self._look.clear()
-        except BaseException as error:  # raised by run(): a thread has nobody to raise to
+        except BaseException as error:  # raised by run()
             self._failure = error
             self._wake()
 
@@ -212,7 +212,7 @@ class CameraServer:
     def _accept(self) -> None:
         try:
             link, _ = self._listener.accept()
-        except OSError:  # it went away again
+        except OSError:  # disconnected again
             return
         link.setblocking(False)
         link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -230,7 +230,7 @@ class CameraServer:
             self._feed(client)
 
     def _hear(self, client: _Client) -> bool:
-        """Read from a client; False where it has gone."""
+        """Read from a client; False if it has disconnected."""
         try:
             data = client.link.recv(4096)
         except BlockingIOError:
@@ -240,7 +240,7 @@ class CameraServer:
         if not data:
             return False
         if client.stream or client.last:
-            return True  # what comes after the request is of no interest
+            return True  # content after the request is ignored
         client.asked += data
         try:
             request = parse_request(bytes(client.asked))
@@ -265,7 +265,7 @@ class CameraServer:
         client.stream, client.once = stream, request.path != stream
         client.asked.clear()
         if client.once:
-            self._newest.pop(stream, None)  # one from now on, not the last that somebody looked at
+            self._newest.pop(stream, None)  # an image from now on, not the last one requested before
         else:
             client.waiting = memoryview(stream_head())
         self._say_event("connected", stream)
@@ -414,7 +414,7 @@ def stream_head() -> bytes:
 
 
 def part(picture: StreamPicture) -> bytes:
-    """One image of a stream, which ends with the next boundary, so that nobody waits for it."""
+    """One image of a stream, ended by the next boundary, so that a client need not wait for it."""
     head = (
         f"Content-Type: image/jpeg\r\nContent-Length: {len(picture.data)}\r\nX-Sequence: {picture.seq}\r\n"
         f"X-Timestamp: {picture.t_shutter_ns // 10**9}.{picture.t_shutter_ns % 10**9:09d}\r\n\r\n"
@@ -448,13 +448,13 @@ def still_path(stream: str) -> str:
 
 
 PRIORITY = 3
-"""SCHED_FIFO where it is allowed: real cameras take no processor; below the servo process and emulated drives."""
+"""SCHED_FIFO priority, if allowed: below the servo process and emulated drives; real cameras use no processor."""
 
 
 def make_camera_emulator(
     cell: CellFile, settings: CamerasSettings, runtime_dir: Path, cell_dir: Path = Path()
 ) -> CameraEmulator:
-    """The cameras of ``settings``, mounted as those of the cell are, before its arm; ``cell_dir``: of the cell file.
+    """The cameras of ``settings``, mounted as those of the cell, before its arm; ``cell_dir``: folder of the cell file.
 
     Raises DriverError.
     """
@@ -483,10 +483,12 @@ def serve_cameras(
     as_json: bool,
     ended: Callable[[], bool],
 ) -> None:
-    """Serve until ``ended``; ``cell_dir``: of the cell file. Raises EmulationError, DriverError, FaultCommandError."""
+    """Serve until ``ended``; ``cell_dir``: folder of the cell file. Raises EmulationError, DriverError,
+    FaultCommandError.
+    """
     settings = cameras_of_cell(cell)
     port = settings.port if channel is None else port_of(channel)
-    cv2.setNumThreads(1)  # on small images they only wait for each other
+    cv2.setNumThreads(1)  # on small images its threads only wait for each other
     emulator = make_camera_emulator(cell, settings, cell_directories(cell.cell.name).runtime, cell_dir)
     for text in orders:
         emulator.order(text, emulator.start_ns)
@@ -495,9 +497,9 @@ def serve_cameras(
     printer = Printer(as_json)
     console = Console(server, printer)
     console.attach()
-    with contextlib.suppress(OSError):  # not allowed: then without
+    with contextlib.suppress(OSError):  # may not be allowed
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    gc.freeze()  # what was imported is not looked through again
+    gc.freeze()  # imported objects are not scanned again
     printer.say(
         "ready",
         f"listening on {server.url}: {', '.join(server.streams.values())}",

@@ -42,7 +42,7 @@ class Cia402Node:
     """Emulated CiA 402 node, see ``node.EmulatedNode``. ``sticky``: error codes of persistent causes, whose reset
     is refused.
 
-    ``frame.id`` is all that it knows of other nodes; two of it with one number behave as two such drives do.
+    It identifies other nodes by ``frame.id`` alone; two nodes with the same number behave as two such drives do.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class Cia402Node:
     # -- power and NMT -------------------------------------------------------------------------------------------
 
     def power_up(self, t_ns: int) -> None:
-        """Power on, or reboot: everything but stored parameters is lost, the axis's power too."""
+        """Power on, or reboot: only stored parameters remain; the axis loses its power, too."""
         self._t_ns = t_ns = max(t_ns, self._t_ns)
         self.nmt = Nmt.BOOTING
         self._boot_ns = t_ns + round(self.settings.boot_ms * 1e6)
@@ -203,8 +203,9 @@ class Cia402Node:
             self._recovered(code)
 
     def _connection_aborted(self, code: int) -> None:
-        """Reaction 0x6007 to a lost connection. An NMT command is a fault only of a powered drive; a lost heartbeat
-        of every one.
+        """Reaction 0x6007 to a lost connection. An NMT command is a fault only of a powered drive, a lost heartbeat of
+        every
+        drive.
         """
         powered = self.machine.powered
         if self.machine.connection_aborted() and (powered or code == HEARTBEAT_LOST):
@@ -255,7 +256,7 @@ class Cia402Node:
         if self.nmt > Nmt.BOOTING and handle(frame):
             self._settle()
 
-    # Each gives whether what it did is to be followed by ``_settle``.
+    # Each returns whether ``_settle`` must follow.
 
     def _receive_sdo(self, frame: CanFrame) -> bool:
         if frame.remote or self.nmt is Nmt.STOPPED:
@@ -290,7 +291,7 @@ class Cia402Node:
                 self._recovered(HEARTBEAT_LOST)
             return True
         if frame.remote or len(frame.data) != 1 or frame.data[0] == 0:
-            return False  # a boot-up frame is no heartbeat
+            return False  # a boot-up frame is not a heartbeat
         if not self._consumer.heard(frame.id - 0x700, self._t_ns):
             return False
         self._recovered(HEARTBEAT_LOST)
@@ -392,7 +393,7 @@ OPTION_CODES = {
     0x605D: range(1, 5),
     0x605E: range(5),
 }
-"""What this drive offers of each."""
+"""Option codes supported by this drive, and their values."""
 
 
 class DriveObjects:
@@ -445,7 +446,7 @@ class DriveObjects:
     @staticmethod
     def _check_sync(sub: int, value: int) -> None:
         if value >> 11:
-            raise SdoError(Abort.INVALID_VALUE)  # it does not produce SYNC, and knows 11 bits only
+            raise SdoError(Abort.INVALID_VALUE)  # it produces no SYNC, and supports 11-bit ids only
 
     @staticmethod
     def _check_signature(sub: int, value: int, signature: int) -> None:
@@ -632,8 +633,8 @@ class HeartbeatConsumer:
 
 
 class LifeGuard:
-    """Node guarding (CiA 301, 7.2.8.2.1): answers remote frames, and monitors that they come within 0x100C times 0x100D
-    from the first one on. A node that produces heartbeats does not.
+    """Node guarding (CiA 301, 7.2.8.2.1): answers remote frames, and monitors that they arrive within 0x100C times
+    0x100D, from the first one on. Inactive in a node that produces heartbeats.
     """
 
     def __init__(self, dictionary: Dictionary) -> None:
@@ -649,7 +650,7 @@ class LifeGuard:
         self._deadline_ns = NEVER_NS
 
     def asked(self, state: int, t_ns: int) -> bytes | None:
-        """Answer to a remote frame: the NMT state with a toggling bit; None where heartbeats are produced."""
+        """Reply to a remote frame: the NMT state with a toggling bit; None if heartbeats are produced."""
         if self._dictionary.get(PRODUCER):
             return None
         life_ms = self._dictionary.get(GUARD_TIME) * self._dictionary.get(LIFE_FACTOR)

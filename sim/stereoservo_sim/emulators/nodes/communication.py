@@ -1,4 +1,4 @@
-"""What an emulated node exchanges: process data by four RPDOs and four TPDOs with their parameters (CiA 301, 7.2.2,
+"""Communication of an emulated node: process data by four RPDOs and four TPDOs with their parameters (CiA 301, 7.2.2,
 7.5.2.35), service data by its SDO server.
 """
 
@@ -18,7 +18,7 @@ TOO_SHORT, TOO_LONG, DEADLINE = 0x8210, 0x8220, 0x8250
 """Emergency codes: PDO not processed, length exceeded, RPDO time-out (CiA 301, table 26)."""
 
 Report = Callable[[int, bool], None]
-"""(emergency code, whether the error is there or gone)."""
+"""Callback with (emergency code, whether the error is present or gone)."""
 
 
 @dataclass
@@ -116,7 +116,7 @@ class ProcessData:
         )
 
     def enter_operational(self, operational: bool) -> None:
-        """Enter the NMT state operational: event-driven TPDOs are sent once, deadlines begin with the first RPDO."""
+        """Enter the NMT state operational: event-driven TPDOs are sent once; deadlines start with the first RPDO."""
         if operational == self.operational:
             return
         self.operational = operational
@@ -136,7 +136,7 @@ class ProcessData:
             self._report(code, False)
 
     def listens(self, frame: CanFrame) -> bool:
-        """Whether the frame is one of these PDOs."""
+        """Whether the frame belongs to one of these PDOs."""
         if not self.operational:
             return False
         return frame.id in (self._requested if frame.remote else self._received)
@@ -167,7 +167,7 @@ class ProcessData:
         at = 0
         for o in rpdo.objects:
             if not o.dummy:
-                with suppress(SdoError):  # nobody to tell: the object keeps its value, as in real drives
+                with suppress(SdoError):  # cannot be reported: the object keeps its value, as in real drives
                     self._dictionary.store(o.index, o.sub, data[at : at + o.size])
             at += o.size
 
@@ -250,7 +250,7 @@ INVALID = 1 << 31
 NO_REMOTE = 1 << 30
 EXTENDED = 1 << 29
 COUNT = 4
-"""PDOs of each direction."""
+"""Number of PDOs in each direction."""
 RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 LONGEST_BITS = 64
@@ -290,7 +290,7 @@ def check_communication(dictionary: Dictionary, index: int, sub: int, value: int
         _check_cob_id(dictionary, index, before, value)
     elif sub == 2:
         if LAST_SYNCHRONOUS < value < EVENT_TYPES[0]:
-            raise SdoError(Abort.INVALID_VALUE)  # reserved; remote requests are not offered
+            raise SdoError(Abort.INVALID_VALUE)  # reserved; remote requests are not supported
     elif exists and transmit and sub in (3, 6):
         raise SdoError(Abort.DEVICE_STATE)  # inhibit time and SYNC start value: not while the PDO exists
 
@@ -349,7 +349,7 @@ _TOGGLE = 0x10
 
 @dataclass
 class _Transfer:
-    """A segmented transfer in progress. ``size`` announced by the client of a download, 0 where it was not."""
+    """A segmented transfer in progress. ``size`` announced by the client of a download, 0 if not announced."""
 
     index: int
     sub: int

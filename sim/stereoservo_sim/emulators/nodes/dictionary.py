@@ -14,9 +14,9 @@ from canopen.objectdictionary import ODVariable
 
 Value = int | float | bytes
 Guard = Callable[[int, int], None]
-"""(sub-index, value) about to be stored by the bus; raises SdoError where the node refuses it."""
+"""Callback with (sub-index, value) before the bus stores it; raises SdoError if the node refuses it."""
 Changed = Callable[[int, int], None]
-"""(sub-index, value) just stored by the bus."""
+"""Callback with (sub-index, value) after the bus has stored it."""
 
 
 class Abort(IntEnum):
@@ -65,7 +65,7 @@ LONGEST_STRING = 512
 
 @dataclass(frozen=True)
 class Entry:
-    """One sub-object as the EDS describes it. ``size`` [bytes]: 0 where it varies."""
+    """One sub-object as described by the EDS. ``size`` [bytes]: 0 if it varies."""
 
     data_type: int
     access: str
@@ -147,7 +147,7 @@ def _parse(path: str, modified_ns: int, node_id: int) -> dict[tuple[int, int], E
 
 
 class Dictionary:
-    """Values of a node's objects. Raises OSError or configparser.Error for an EDS that cannot be read."""
+    """Values of a node's objects. Raises OSError or configparser.Error for an unreadable EDS."""
 
     def __init__(self, eds: Path, node_id: int) -> None:
         self.entries = _parse(str(eds), eds.stat().st_mtime_ns, node_id)
@@ -167,7 +167,7 @@ class Dictionary:
         self._changed[index] = tell
 
     def live(self, index: int, sub: int, value: Callable[[], int]) -> None:
-        """Compute the object's value when it is read. No effect where the EDS lacks it."""
+        """Compute the object's value when it is read. No effect if the EDS lacks it."""
         if (index, sub) in self.entries:
             self._live[index, sub] = value
 
@@ -176,19 +176,19 @@ class Dictionary:
         self._readings[index] = check
 
     def get(self, index: int, sub: int = 0, default: int = 0) -> int:
-        """The value of an integer object, for the firmware; ``default`` where the EDS lacks it."""
+        """The value of an integer object, for the firmware; ``default`` if the EDS lacks it."""
         live = self._live.get((index, sub))
         if live is not None:
             return live()
         return int(self._values.get((index, sub), default))
 
     def set(self, index: int, sub: int, value: Value) -> None:
-        """Set a value from the firmware: without checks and callbacks. No effect where the EDS lacks it."""
+        """Set a value from the firmware: without checks and callbacks. No effect if the EDS lacks it."""
         if (index, sub) in self.entries:
             self._values[index, sub] = value
 
     def find(self, index: int, sub: int) -> Entry:
-        """Description of an object. Raises SdoError where there is none."""
+        """Description of an object. Raises SdoError if it does not exist."""
         entry = self.entries.get((index, sub))
         if entry is None:
             raise SdoError(Abort.NO_SUB_INDEX if index in self._indices else Abort.NO_OBJECT)

@@ -17,7 +17,7 @@ from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 # -- the state machine ---------------------------------------------------------------------------------------
 # The power state machine of CiA 402-2 (IEC 61800-7-201): states, commands, transitions 0 to 16, option codes.
 #
-# It decides; ``drive_motion.py`` does what it asks for (power, brake, ramps) and says when that is done.
+# It decides; ``drive_motion.py`` executes its requests (power, brake, ramps) and reports their completion.
 
 
 class Cia402State(StrEnum):
@@ -76,7 +76,7 @@ ABORT_OPTION = 0x6007
 
 
 def command(word: int) -> Command | None:
-    """The command in a control word; none where bit 7 is set."""
+    """The command in a control word; none if bit 7 is set."""
     if word & FAULT_RESET:
         return None
     if not word & 0x02:
@@ -91,12 +91,15 @@ def command(word: int) -> Command | None:
 class PowerMachine:
     """State of the power drive system.
 
-    ``option(index)``: the drive's option codes. ``clear_faults()``: a fault reset is asked for; whether it succeeds.
-    ``ramp``: how the drive is to come to rest, None while nothing asks for it; ``after``: the state that follows once
-    it stands and the brake is closed, None: it stays, held by torque. ``opening``: power is on and the brake opens,
-    before ENABLED (transition 4 is complete when the drive can move).
+    ``option(index)``: the drive's option codes. ``clear_faults()``: called for a fault reset; returns whether it
+    succeeds.
+    ``ramp``: how the drive is to come to rest, None without a request; ``after``: the state that follows once it is at
+    rest
+    and the brake is closed, None: it stays, held by torque. ``opening``: power is on and the brake opens, before
+    ENABLED
+    (transition 4 is complete when the drive can move).
 
-    A command that changes the state is carried out before the next (IEC 61800-7-201): one that comes while the drive
+    A command that changes the state is completed before the next (IEC 61800-7-201): one that arrives while the drive
     slows down for transition 5 or 8 waits, the newest counts; disable voltage and quick stop do not wait. Transition
     16 needs a new command: a master that keeps sending "enable" does not undo a quick stop that the drive began.
     """
@@ -149,7 +152,7 @@ class PowerMachine:
         self._obey(given, new=given is not before)
 
     def fault(self) -> None:
-        """Transition 13, from any state; 14 at once where no power stage must be brought to rest."""
+        """Transition 13, from any state; 14 at once if no power stage must be brought to rest."""
         if self.state in (Cia402State.FAULT_REACTION, Cia402State.FAULT):
             return
         moving = self.state in (Cia402State.ENABLED, Cia402State.QUICK_STOP)
@@ -217,7 +220,7 @@ class PowerMachine:
             elif given is Command.SHUTDOWN:
                 self._enter(Cia402State.READY)  # 6
             else:
-                self.opening = given is Command.ENABLE  # 4, or given up before the brake was open
+                self.opening = given is Command.ENABLE  # 4, or abandoned before the brake was open
         elif state is Cia402State.ENABLED:
             self._obey_enabled(given)
         elif state is Cia402State.QUICK_STOP:
@@ -244,24 +247,24 @@ class PowerMachine:
 
 PROFILE_POSITION, PROFILE_VELOCITY, CYCLIC_VELOCITY = 1, 3, 9
 NEW_SET_POINT = 0x0010
-"""Of the control word in profile position."""
+"""New set-point bit of the control word in profile position."""
 FOLLOWING_ERROR = 0x8611
 REACHED_SHARE = 0.01
 """Velocity window of "target reached" as a share of the largest velocity; the EDS has no 0x606D."""
 STANDING_UNITS = 1
-"""Up to this velocity [velocity units] bit 12 of profile velocity reports zero speed (0x606F)."""
+"""Speed up to which bit 12 of profile velocity reports zero speed (0x606F) [velocity units]."""
 PARAMETERS = (HALT_OPTION, 0x6065, 0x6066, 0x607D, 0x607F, 0x6080, 0x6083, 0x6084, 0x6085)
 LIMIT_FACTOR = 2.0
-"""Braking at the current limit, as a multiple of the quick stop deceleration."""
+"""Deceleration at the current limit, as a multiple of the quick stop deceleration."""
 
 
 def wrap32(value: int) -> int:
-    """``value`` in 32 bits, as a counter that overflows."""
+    """``value`` wrapped to 32 bits, as by a counter that overflows."""
     return (value + 2**31) % 2**32 - 2**31
 
 
 def clamp16(value: int) -> int:
-    """``value`` held inside 16 bits."""
+    """``value`` clamped to 16 bits."""
     return max(-(2**15), min(2**15 - 1, value))
 
 
@@ -341,12 +344,10 @@ class DriveMotion:
         value = self._dictionary.get(index)
         return value / abs(self._units) if value else self.axis.joint.acceleration_max
 
-    # -- what is measured ----------------------------------------------------------------------------------------
+    # -- measured values -------------------------------------------------------------------------------------------
 
     def _measured(self) -> float:
-        """Joint position as the encoder reports it: mirrored about the position at which an injected reversal
-        began.
-        """
+        """Joint position reported by the encoder: mirrored about the position at which an injected reversal began."""
         axis = self.axis
         if not axis.inverted_encoder:
             self._mirror = None
@@ -376,7 +377,7 @@ class DriveMotion:
         return self.axis.set_position - self._measured() if self.machine.powered else 0.0
 
     def following_error(self) -> int:
-        """0x60F4 [counts]: demanded less measured position."""
+        """0x60F4 [counts]: demanded minus measured position."""
         return max(-(2**31), min(2**31 - 1, round(self._counts * self._error())))
 
     def digital_inputs(self) -> int:
@@ -386,7 +387,7 @@ class DriveMotion:
 
     def status(self) -> int:
         """Status word 0x6041. Bit 12 in mode 9: the drive follows the command; in mode 3: speed is zero; in mode 1: the
-        set-point is taken. Bit 10 in modes 1 and 3: target reached.
+        set-point is accepted. Bit 10 in modes 1 and 3: target reached.
         """
         machine = self.machine
         word = STATUS[machine.state] | 0x10 | 0x200
@@ -412,7 +413,7 @@ class DriveMotion:
         target = self._dictionary.get(0x60FF)
         return abs(self.velocity() - target) <= max(REACHED_SHARE * self._largest, STANDING_UNITS)
 
-    # -- what is done --------------------------------------------------------------------------------------------
+    # -- actions ---------------------------------------------------------------------------------------------------
 
     def power_lost(self, t_ns: int) -> None:
         """Reset after loss of the supply or a reboot of the firmware."""
@@ -420,7 +421,7 @@ class DriveMotion:
         self._limited = self._following = self._acknowledged = False
         self._goal = None
         self._beyond_since_ns = NEVER_NS
-        self._brake.move(True, t_ns)  # it closes without power
+        self._brake.move(True, t_ns)  # the brake closes without power
         self._rest()
 
     def _rest(self) -> None:
@@ -476,8 +477,9 @@ class DriveMotion:
     def _follow(self) -> None:
         """Enabled: follow the target velocity within the drive's limits, with ramps of 0x6083 and 0x6084.
 
-        In cyclic synchronous velocity the standard leaves ramps to the master; this drive bounds the acceleration by
-        0x6083 there, in both directions, as many do.
+        In cyclic synchronous velocity the standard leaves ramps to the master; this drive, like many, limits the
+        acceleration
+        by 0x6083 there, in both directions.
         """
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)
@@ -498,14 +500,16 @@ class DriveMotion:
         self._following = mode == CYCLIC_VELOCITY and not stopped
 
     def take_set_point(self) -> None:
-        """Profile position: the rising edge of the control word's bit 4 takes 0x607A, at once; its fall ends bit 12."""
+        """Profile position: the rising edge of the control word's bit 4 accepts 0x607A at once; the falling edge clears
+        bit 12.
+        """
         asked = bool(self.machine.word & NEW_SET_POINT) and self.machine.state is Cia402State.ENABLED
         if asked and not self._acknowledged:
             self._goal = self._dictionary.get(0x607A) / self._counts - self._offset
         self._acknowledged = asked
 
     def _go(self) -> None:
-        """Profile position: towards the set-point, no faster than the ramp lets it stop there."""
+        """Profile position: move to the set-point, no faster than the ramp can stop there."""
         axis = self.axis
         axis.acceleration = self._speeding_up
         axis.target = 0.0
@@ -523,7 +527,8 @@ class DriveMotion:
     def _barred(self, side: float) -> bool:
         """Whether a limit switch or a software limit (0x607D) prevents motion to ``side`` of the joint.
 
-        Software limits are seen in time for the quick stop ramp to end there; the whole range of 32 bits is no limit.
+        Software limits act early enough for the quick stop ramp to end there; the whole range of 32 bits means no
+        limit.
         """
         axis = self.axis
         if axis.limit_switch * side > 0:

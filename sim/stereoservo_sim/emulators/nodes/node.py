@@ -12,8 +12,7 @@ from stereoservo_drivers.can.frames import CanFrame
 
 @dataclass
 class EmulatedAxis:
-    """Shared state of an axis: the firmware writes the first group, the plant the second, injected faults the
-    third.
+    """Shared state of an axis: the firmware writes the first group, the plant the second, injected faults the third.
 
     [rad, rad/s, rad/s² or m]. ``effort``: share of the rated torque, signed. ``set_position`` and ``set_velocity`` are
     the drive's own ramp, which the plant follows.
@@ -35,11 +34,11 @@ class EmulatedAxis:
     blocked: bool = False
     inverted_encoder: bool = False
     limit_switch: int = 0
-    """-1, 0 or 1: the limit switch of that side is active."""
+    """-1, 0 or 1: the limit switch of that side is active; 0: none."""
 
     @property
     def following_error(self) -> float:
-        """Set less actual position."""
+        """Set-point minus actual position."""
         return self.set_position - self.position
 
 
@@ -49,9 +48,10 @@ class NodeSettings:
     frame.
 
     ``tick_ns``: period of the drive's own control while its power stage is on. ``sync_timeout_factor``: periods of
-    0x1006 without SYNC that make error 0x8700. ``following_window``: limit of the following error [rad or m] where
-    the EDS has no 0x6065. ``identity``: of 0x1018 by sub-index, before what the joint's options ask for.
-    ``pdos_by_default``: whether the EDS's PDOs exist after power on (they do in EPOS4: RPDO 3 and 4 then hear
+    0x1006 without SYNC that cause error 0x8700. ``following_window``: limit of the following error [rad or m] if the
+    EDS
+    has no 0x6065. ``identity``: of 0x1018 by sub-index, overrides the joint's options.
+    ``pdos_by_default``: whether the EDS's PDOs exist after power on (they do in EPOS4: RPDO 3 and 4 then receive
     control words on 0x400 and 0x500 + node id); False switches all off. ``reset_needs_communication_reset``: after
     0x8130 and 0x8120 the drive refuses a fault reset until NMT reset communication (EPOS4).
     ``preoperational_aborts``: NMT pre-operational counts as a lost connection (0x6007); NMT stop and reset always do.
@@ -90,11 +90,11 @@ class EmulatedNode(Protocol):
         ...
 
     def advance(self, t_ns: int) -> None:
-        """Run timers up to ``t_ns``: heartbeats, time-outs, ramps' ends, the axis's new state."""
+        """Run timers up to ``t_ns``: heartbeats, time-outs, ends of ramps, the axis's new state."""
         ...
 
     def due_ns(self) -> int:
-        """Time at which ``advance`` is next needed; NEVER_NS where nothing is pending."""
+        """Time at which ``advance`` is next needed; NEVER_NS if nothing is pending."""
         ...
 
     def outgoing(self) -> list[CanFrame]:

@@ -32,8 +32,8 @@ STATE_NAMES = {AXIS_IDLE: "idle", AXIS_CLOSED_LOOP: "closed loop control"}
 class OdriveSettings:
     """Settings made over USB, and limits of the hardware. Ramps [turns/s²] of the motor, ``current_limit`` [A].
 
-    ``watchdog_ns``: an armed axis that gets no velocity for so long disarms; 0: never.
-    ``torque_acceleration``: what the motor's torque allows where the input is not ramped.
+    ``watchdog_ns``: an armed axis that receives no velocity for this time disarms; 0: never.
+    ``torque_acceleration``: the motor torque's limit on the acceleration if the input is not ramped.
     """
 
     heartbeat_ns: int = 100 * MS
@@ -83,7 +83,7 @@ class OdriveNode:
         return self._heartbeat_due_ns != NEVER_NS
 
     def power_up(self, t_ns: int) -> None:
-        """Boot: silent for ``boot_ns``, then heartbeats. Nothing of what was set over the bus remains."""
+        """Boot: silent for ``boot_ns``, then heartbeats. Settings made over the bus are lost."""
         self._start_from_configuration()
         self._queue.clear()
         self._boot_end_ns = t_ns + self.settings.boot_ns
@@ -93,7 +93,7 @@ class OdriveNode:
         return True
 
     def receive(self, frame: CanFrame, t_ns: int) -> None:
-        """Answer a remote frame, take a command."""
+        """Answer a remote frame, or execute a command."""
         self.advance(t_ns)
         if not self.booted or frame.extended or frame.id >> 5 != self.node_id:
             return
@@ -192,7 +192,7 @@ class OdriveNode:
             self._watchdog_due_ns = t_ns + self.settings.watchdog_ns
 
     def _set_target(self) -> None:
-        """Set the target of the velocity loop; position control holds its position, since nothing here sets
+        """Set the target of the velocity loop; position control holds its position, since no command here sets
         positions.
         """
         if self.axis_state != AXIS_CLOSED_LOOP:
@@ -259,4 +259,4 @@ _COMMANDS = {
     MSG_REBOOT: (OdriveNode._take_reboot, 0),
     MSG_CLEAR_ERRORS: (OdriveNode._take_clear_errors, 0),
 }
-"""By command: who takes it, the least number of data bytes."""
+"""By command: its handler, and the least number of data bytes."""

@@ -1,1 +1,1 @@
-"""Any arm in the simulated cell: read from URDF files, with its cell and goals found by search."""
+"""Arbitrary arms in the simulated cell: read from URDF files; cell layout and goals are found by search."""

@@ -1,7 +1,7 @@
-"""The simulated cell of any arm: its place, marker body and cameras from a cell file's options; where they are not
-stated, the configuration around which the cell is laid out is searched for, and so are the demonstration's goals.
+"""The simulated cell of an arbitrary arm: mounting, marker body and cameras from the options of a cell file.
 
-Every process of a cell finds the same: the search is seeded, and depends on the options alone.
+What is not stated is found by search: the base configuration around which the cell is laid out, and the
+demonstration's goals. The search is seeded and depends on the options alone, so every process finds the same cell.
 """
 
 from __future__ import annotations
@@ -29,30 +29,33 @@ from stereoservo_sim.world.workpiece import Moved
 Length = Annotated[float, Meta(gt=0, le=20)]
 
 CANDIDATES, EXAMINED = 600, 8
-"""Configurations that are drawn for the base, and how many of the best are looked at through the cameras."""
+"""Number of base configurations drawn, and number of the best that are checked for visibility in the cameras."""
 WIDEST = 2.4
-"""From the middle of its range a joint's base is drawn up to here [rad]: some turn several times."""
+"""A joint's base is drawn within this distance from the centre of its range [rad]: some joints turn several times."""
 CLEAR = {"revolute": 0.5, "prismatic": 0.1}
-"""From its limits a joint's base should stand so far at least [rad or m]."""
+"""Required distance of a joint's base from its limits [rad or m]."""
 LEVER = 0.3
-"""Length [m] at which a turn of the body counts as much as a translation."""
+"""Length [m] that weighs rotations of the body against translations."""
 HEIGHT = 0.25
-"""Above the floor, where the arm stands, of body and cameras [m]."""
+"""Required height of body and cameras above the floor, on which the arm stands [m]."""
 TRIALS = {"revolute": (0.1, 0.2, 0.3, 0.45), "prismatic": (0.04, 0.08, 0.12, 0.16)}
-"""Motions to either side of the base that are looked at [rad or m]."""
+"""Tested displacements of each joint to either side of the base [rad or m]."""
 BEHIND_BODY = 0.05
-"""From what the flange carries already to the ridge of the body [m]."""
+"""Distance from the parts already on the flange to the ridge of the body [m]."""
 
 
 class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of a cell file on which arm is simulated, and where things stand; with no ``urdf`` the embedded one.
+    """Options of a cell file: which arm is simulated, and its layout. Without ``urdf``: the embedded arm.
 
-    ``urdf``: a file, relative to the cell file, shipped here, or of pybullet_data. ``flange``: the link that carries
-    the body (default: see `urdf_file.load_urdf`). ``mounted``: the arm's root in the world. ``carried``: the marker
-    body on the flange (with cameras on the arm: the rig), from its default, which looks along the flange's z from in
-    front of what is there. ``base``: positions by joint [rad or m] around which the cell is laid out; of joints left
-    out they are searched for. ``distance_m`` from the rig to the body, by default 1.4 m, or 0.85 m with the cameras on
-    the arm; ``baseline_m`` between the cameras; ``focal_px`` of both.
+    ``urdf``: a file, relative to the cell file, shipped here, or of pybullet_data.
+    ``flange``: the link that carries the body (default: see `urdf_file.load_urdf`).
+    ``mounted``: pose of the arm's root in the world.
+    ``carried``: displacement of the marker body on the flange (of the rig, if the cameras are on the arm) from its
+    default
+    pose, which looks along the flange's z from in front of the parts there.
+    ``base``: positions by joint [rad or m] around which the cell is laid out; those of omitted joints are searched for.
+    ``distance_m``: from the rig to the body; default 1.4 m, or 0.85 m if the cameras are on the arm.
+    ``baseline_m``: between the cameras; ``focal_px``: of both.
     """
 
     urdf: str = ""
@@ -66,7 +69,7 @@ class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 def place_of(options: Mapping[str, Any]) -> ArmPlace:
-    """What ``options`` of a joint driver, or of emulated drives, say of the arm; the rest of them is left alone.
+    """The options on the arm among ``options`` of a joint driver or of emulated drives; others are ignored.
 
     Raises ValueError.
     """
@@ -98,7 +101,9 @@ def _found(encoded: bytes, mount: Mount, path: Path) -> SimulatedCell:
 
 
 def laid_out(robot: Robot, place: ArmPlace, mount: Mount, base: FloatArray) -> SimulatedCell:
-    """The cell around ``base`` (n,): eye-to-hand the body on the flange and the rig before it, else the other way."""
+    """The cell laid out around ``base`` (n,): eye-to-hand with the body on the flange and the rig before it, else
+    reversed.
+    """
     carried = translation(0.0, 0.0, _reach(robot) + BEHIND_BODY) @ place.carried.matrix
     flange = flange_pose(robot, base)
     if mount == "eye_in_hand":
@@ -131,7 +136,7 @@ def laid_out(robot: Robot, place: ArmPlace, mount: Mount, base: FloatArray) -> S
 
 
 def _reach(robot: Robot) -> float:
-    """How far [m] what moves with the flange stands out along its z."""
+    """Extent [m] along the flange's z of the parts that move with the flange."""
     back = inverse_pose(robot.links[-1])
     last = [shape for shape in robot.shapes if shape.link == len(robot.joints)]
     tops = [
@@ -146,8 +151,9 @@ def _reach(robot: Robot) -> float:
 
 
 def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
-    """Configuration (n,) with the joints clear of their limits, the body's motion well-conditioned, and the body in all
-    cameras there and while each joint moves alone. Raises ValueError where none is found.
+    """Base configuration (n,): joints clear of their limits, the body's motion well-conditioned, and the body visible
+    in
+    all cameras there and while each joint moves alone. Raises ValueError if none is found.
     """
     stated = _stated(robot, place.base)
     if not np.isnan(stated).any():
@@ -186,7 +192,7 @@ def _stated(robot: Robot, base: Mapping[str, float]) -> FloatArray:
 
 
 def body_jacobian(robot: Robot, q: FloatArray, point: FloatArray) -> FloatArray:
-    """Translation at ``point`` (3,) in the world and rotation times ``LEVER`` by each joint at ``q`` (n,), (6, n)."""
+    """Jacobian (6, n) at ``q`` (n,): translation of ``point`` (3,) in the world, and rotation times ``LEVER``."""
     frames, _ = joint_frames(robot, q)
     axes = frames[:, :3, 2]
     swung = np.cross(axes, point - frames[:, :3, 3])
@@ -195,7 +201,7 @@ def body_jacobian(robot: Robot, q: FloatArray, point: FloatArray) -> FloatArray:
 
 
 def _suitability(robot: Robot, q: FloatArray) -> float:
-    """How good a base ``q`` (n,) is before one looks through cameras: more is better."""
+    """Score of a base ``q`` (n,) before visibility is checked: higher is better."""
     pose = flange_pose(robot, q)
     body = pose[:3, 3] + 0.1 * pose[:3, 2]
     values = np.linalg.svd(body_jacobian(robot, q, body), compute_uv=False)
@@ -211,7 +217,7 @@ def _suitability(robot: Robot, q: FloatArray) -> float:
 
 
 def _room_before_cameras(cell: SimulatedCell) -> float:
-    """How far each joint may move alone with every marker in sight: more is better, minus infinity is not at all."""
+    """Score of how far each joint may move alone with all markers visible: higher is better; -inf: not at all."""
     if not seen_by_all(cell, cell.base) or _inside_arm(cell):
         return -np.inf
     score = 0.0
@@ -230,7 +236,7 @@ def _room_before_cameras(cell: SimulatedCell) -> float:
 
 
 def _inside_arm(cell: SimulatedCell) -> bool:
-    """Whether a camera, or with cameras on the arm the body, stands within a hand's breadth of the arm at its base."""
+    """Whether a camera (the body, if the cameras are on the arm) is within 0.1 m of the arm at its base."""
     ends, radii = shape_segments(cell.robot, cell.base)
     if cell.stand is not None:
         points = cell.marker_positions(cell.base)

@@ -1,4 +1,4 @@
-"""Goals of a demonstration, found for any simulated arm: configurations that all cameras see, and the ways there."""
+"""Finds goals of a demonstration for any simulated arm: configurations, and paths to them, that all cameras see."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from stereoservo_sim.world.robots import RX90, Robot, flange_pose, joint_frames
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, HAND_GOALS, SimulatedCell
 
 DRAWN, ENOUGH = 600, 16
-"""Configurations that are drawn at most, and good ones that are enough."""
+"""Largest number of configurations drawn, and number of good ones at which drawing ends."""
 SWING = {"revolute": 0.7, "prismatic": 0.25}
-"""From the base a joint is drawn up to here [rad or m], the last one of an arm up to ``WIDEST``."""
+"""Range of the draw about each joint's base [rad or m]; for an arm's last joint up to ``WIDEST``."""
 CLEAR = {"revolute": 0.1, "prismatic": 0.02}
-"""Kept from the joints' limits, at the goal and on the way [rad or m]."""
+"""Required distance from the joints' limits, at the goal and on the path [rad or m]."""
 LOOKED_AT = 9
-"""Configurations of a way at which the cameras are asked."""
+"""Configurations of a path at which visibility is checked."""
 LEAST_TURN, LEAST_WAY = 0.15, 0.03
-"""Below both, a goal is not worth going to [rad], [m]."""
+"""A goal below both, rotation [rad] and translation [m], is too close to be used."""
 STIFFEST = 0.02
-"""Smallest over largest singular value of the body's motion by the joints, at the goal and on the way."""
+"""Least ratio of smallest to largest singular value of the body's Jacobian, at the goal and on the path."""
 STEPS = 30
-"""Of the straight way, in each of which the joints are solved for."""
+"""Steps of the straight path; inverse kinematics is solved in each."""
 
 
 def goals_of(cell: SimulatedCell) -> dict[str, FloatArray]:
-    """Goal configurations (n,) of a cell by name: ``near``, ``roll`` (turns farthest), ``far``.
+    """Goal configurations (n,) of a cell by name: ``near``, ``roll`` (largest rotation), ``far``.
 
-    At them and on the ways there from the base, straight in the joints and, where the arm can, straight in space,
-    every camera sees every marker, and no joint comes to its limit. Raises ValueError where there are fewer than three.
+    At them, and on the paths to them from the base (straight in joint space and, if the arm can, straight in space),
+    every camera sees every marker, and no joint reaches its limit. Raises ValueError if fewer than three are found.
     """
     if cell.robot is RX90:
         return DEMO_GOALS if cell.stand is None else HAND_GOALS
@@ -63,9 +63,9 @@ def goals_of(cell: SimulatedCell) -> dict[str, FloatArray]:
 
 
 def goes_straight(robot: Robot, q: FloatArray) -> bool:
-    """Whether the arm's motions at ``q`` (n,) make a group: then whatever it reaches, it reaches on a straight way.
+    """Whether the arm's motions at ``q`` (n,) form a group: every pose it reaches is then reached on a straight path.
 
-    All six freedoms are one; so are those of a SCARA or a gantry, and not those of a pan-tilt head.
+    True for all six degrees of freedom, a SCARA or a gantry; false for a pan-tilt head.
     """
     frames, _ = joint_frames(robot, q)
     axes, straight = frames[:, :3, 2], robot.prismatic[:, None]
@@ -102,14 +102,14 @@ def _body_in_rig(cell: SimulatedCell, q: FloatArray) -> FloatArray:
 
 
 def _flange_for(cell: SimulatedCell, seen: FloatArray) -> FloatArray:
-    """Pose of the flange with which the rig has the body at ``seen`` (4, 4)."""
+    """Flange pose at which the rig sees the body at pose ``seen`` (4, 4)."""
     if cell.stand is None:
         return inverse_pose(cell.rig.world_to_rig) @ seen
     return cell.stand @ inverse_pose(seen) @ cell.rig.world_to_rig
 
 
 def _motion(cell: SimulatedCell, q: FloatArray) -> tuple[float, float]:
-    """How far [rad], [m] the body turns, and its middle moves, as the rig sees it, from the base to ``q`` (n,)."""
+    """Rotation [rad] of the body and translation [m] of its centre from the base to ``q`` (n,), in the rig's frame."""
     before, after = _body_in_rig(cell, cell.base), _body_in_rig(cell, q)
     middle = cell.body.marker_points.mean(axis=0)
     moved = (after[:3, :3] - before[:3, :3]) @ middle + after[:3, 3] - before[:3, 3]
@@ -118,7 +118,7 @@ def _motion(cell: SimulatedCell, q: FloatArray) -> tuple[float, float]:
 
 
 def _good(cell: SimulatedCell, q: FloatArray, straight: bool) -> bool:
-    """Whether a goal ``q`` (n,) and the ways to it are well seen, within limits and away from singularities."""
+    """Whether a goal ``q`` (n,) and the paths to it are visible, within limits and away from singularities."""
     if not seen_by_all(cell, q):
         return False
     shares = np.linspace(0.0, 1.0, LOOKED_AT)[:, None]
@@ -138,9 +138,10 @@ def _stiff(robot: Robot, q: FloatArray) -> bool:
 
 
 def straight_way(cell: SimulatedCell, q: FloatArray) -> FloatArray | None:
-    """Joints (k, n) that take the body straight, as the rig sees it, from the base to its pose at ``q`` (n,).
+    """Joint path (k, n) that moves the body from the base to its pose at ``q`` (n,) on a straight line in the rig's
+    frame.
 
-    None where a joint would come to its limit or the arm cannot follow.
+    None if a joint would reach its limit or the arm cannot follow.
     """
     start, end = _body_in_rig(cell, cell.base), _body_in_rig(cell, q)
     middle = np.append(cell.body.marker_points.mean(axis=0), 1.0)
@@ -163,8 +164,8 @@ def straight_way(cell: SimulatedCell, q: FloatArray) -> FloatArray | None:
 
 
 def joints_nearby(robot: Robot, wanted: FloatArray, q: FloatArray) -> tuple[FloatArray, float]:
-    """Joints (n,) near ``q`` (n,) that bring the flange to the pose ``wanted`` (4, 4), by Newton's steps, and what the
-    last of these found left [m, or as much by a turn].
+    """Joints (n,) near ``q`` (n,) that bring the flange to the pose ``wanted`` (4, 4), by Newton's method, and the
+    residual before the last step [m; rotations times the lever].
     """
     for _ in range(3):
         pose = flange_pose(robot, q)

@@ -1,7 +1,7 @@
 """Reads an arm from a URDF file: the chain from its root to the flange, with joints' limits, masses and shapes.
 
-Joints beside the chain, such as a gripper's, stay at zero, or at the nearest position that they can take; what they
-carry belongs to the link that carries them. Which these are is told (``Robot.notes``).
+Joints beside the chain, such as a gripper's, are fixed at zero or the nearest position in their range; what they carry
+becomes part of the link that carries them. They are listed in ``Robot.notes``.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ from stereoservo_sim.world.robots import Capsule, Robot
 
 MOVING: dict[str, JointKindName] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 LARGEST = 1e6
-"""Beyond, a number is a damaged one [m, kg, rad]; but for limits, where large ones mean none."""
+"""Larger numbers are taken for damaged data [m, kg, rad]; except limits, where large numbers mean none."""
 NO_LIMIT = 1e39
 FASTEST: dict[JointKindName, float] = {"revolute": 1.0, "prismatic": 0.4}
-"""At most so fast a simulated joint is [rad/s or m/s]: a file states what the motor can, or nothing."""
+"""Largest speed of a simulated joint [rad/s or m/s]: files state the motor's limit or none."""
 ACCELERATION: dict[JointKindName, float] = {"revolute": 4.0, "prismatic": 2.0}
-"""Which no URDF states [rad/s² or m/s²]."""
+"""Acceleration of simulated joints [rad/s² or m/s²]; a URDF states none."""
 ENDLESS = float(2.0 * np.pi)
-"""Range to either side of a joint that turns without end [rad]."""
+"""Range to either side of a continuous joint [rad]."""
 SHORTEST = 1e-3
-"""Between the ends of a capsule [m]: of a ball it is a short one."""
+"""Least length between the end points of a capsule [m]; a sphere is a capsule of this length."""
 
 
 def urdf_path(named: str, folder: Path) -> Path:
-    """File of the URDF ``named`` in a cell file: relative to its ``folder``, else one that is shipped here, else one of
+    """Path of the URDF ``named`` in a cell file: relative to its ``folder``, else a file shipped here, else one of
     pybullet_data. Raises UrdfError.
     """
     places = [folder, Path(str(files("stereoservo_sim.world.arms")))]
@@ -57,9 +57,9 @@ def urdf_path(named: str, folder: Path) -> Path:
 def load_urdf(path: Path, *, flange: str = "", mounted: FloatArray | None = None) -> Robot:
     """The arm of a URDF file, its root link at ``mounted`` (4, 4) in the world.
 
-    ``flange``: the link that carries the body; default: the last before nothing moves any more, or before the tree
-    branches into several moving joints (a gripper's fingers), or before a gripper's single jaw. What of the file is
-    left out, and how it is included, is in the robot's ``notes``. Raises UrdfError.
+    ``flange``: the link that carries the body; default: the last moving link, or the last before the tree branches into
+    several moving joints (a gripper's fingers) or before a gripper's single jaw. The robot's ``notes`` list what is
+    omitted, and how it is included. Raises UrdfError.
     """
     with decoding(lambda cause: UrdfError(f"{path}: {cause}"), passed=(UrdfError,)):
         return _robot(_read(path), flange, np.eye(4) if mounted is None else mounted)
@@ -218,14 +218,14 @@ def _spec(joint: UrdfJoint, path: Path) -> JointSpec:
     return JointSpec(joint.name, kind, low, high, speed, ACCELERATION[kind])
 
 
-# -- what hangs on each joint ---------------------------------------------------------------------------------
+# -- rigid parts of each joint ---------------------------------------------------------------------------------
 
 Part = list[tuple[FloatArray, Element]]
-"""Links that move as one, each with its pose (4, 4) in their joint's frame."""
+"""Rigidly connected links, each with its pose (4, 4) in their joint's frame."""
 
 
 def _rigid_parts(tree: UrdfTree, chain: list[UrdfJoint], mounted: FloatArray) -> list[Part]:
-    """Of the base, in the world, and of every moving joint of the chain, in its frame."""
+    """Rigid parts: of the base in the world, and of every moving joint of the chain in its frame."""
     along = {joint.name for joint in chain if joint.moves}
     parts: list[Part] = [[]]
     waiting = [(chain[0].parent, mounted, 0)]  # depth first, in the file's order
@@ -243,14 +243,14 @@ def _rigid_parts(tree: UrdfTree, chain: list[UrdfJoint], mounted: FloatArray) ->
 
 
 def _resting(joint: UrdfJoint, path: Path) -> FloatArray:
-    """Motion (4, 4) of a joint beside the chain to where it rests."""
+    """Motion (4, 4) of a joint beside the chain to its rest position."""
     if not joint.moves:
         return np.eye(4)
     return motion(joint.kind, joint.axis, resting_position(joint.element, path))
 
 
 def resting_position(element: Element, path: Path) -> float:
-    """Zero, or what of a joint's range is nearest to it [rad or m]."""
+    """Rest position of a joint [rad or m]: zero, or the nearest position in its range."""
     limit = element.find("limit")
     if limit is None or element.get("type") == "continuous":
         return 0.0
@@ -258,7 +258,7 @@ def resting_position(element: Element, path: Path) -> float:
 
 
 def motion(kind: str, axis: FloatArray, value: float) -> FloatArray:
-    """Motion (4, 4) by ``value`` about, or with ``prismatic`` along, ``axis`` (3,)."""
+    """Rotation (4, 4) by ``value`` about ``axis`` (3,), or translation along it if ``prismatic``."""
     moved = np.eye(4)
     if kind == "prismatic":
         moved[:3, 3] = value * axis / np.linalg.norm(axis)
@@ -269,7 +269,7 @@ def motion(kind: str, axis: FloatArray, value: float) -> FloatArray:
 
 
 def _weight(part: Part, path: Path) -> tuple[float, FloatArray]:
-    """Mass [kg] and its centre (3,) [m] of a part."""
+    """Mass [kg] of a part and its centre (3,) [m]."""
     mass, moment = 0.0, np.zeros(3)
     for pose, link in part:
         inertial = link.find("inertial")
@@ -293,7 +293,7 @@ def _shapes(parts: list[Part], path: Path) -> Iterator[Capsule]:
 
 
 def _corners(geometry: Element | None, path: Path) -> FloatArray:
-    """Points (k, 3) [m] of a geometry's surface: the corners of a box or mesh, rings of what is round."""
+    """Points (k, 3) [m] on a geometry's surface: corners of a box or mesh, rings of cylinders and spheres."""
     if geometry is None or len(geometry) == 0:
         return np.zeros((0, 3))
     shape = geometry[0]
@@ -313,11 +313,11 @@ def _corners(geometry: Element | None, path: Path) -> FloatArray:
 
 
 def _mesh_points(named: str, path: Path) -> FloatArray:
-    """Vertices (k, 3) of an .obj or .stl file; none of another, or where it is not found."""
+    """Vertices (k, 3) of an .obj or .stl file; none for other formats or if the file is not found."""
     bare = named.split("://", 1)[-1]
     try:
         file = next((place for parent in path.parents if (place := parent / bare).is_file()), None)
-    except OSError:  # a name that no file can have
+    except OSError:  # an invalid file name
         return np.zeros((0, 3))
     if file is None or file.suffix.lower() not in (".obj", ".stl"):
         return np.zeros((0, 3))
@@ -337,12 +337,12 @@ def _vertices(data: bytes, obj: bool) -> FloatArray:
         rows = [line.split()[1:4] for line in data.splitlines() if line.strip().startswith(b"vertex")]
         return np.array(rows, dtype=np.float64).reshape(-1, 3)
     facets = np.frombuffer(data, dtype=np.dtype([("numbers", "<f4", 12), ("end", "<u2")]), offset=84, count=count)
-    with np.errstate(invalid="ignore"):  # what is no number is refused with its name
+    with np.errstate(invalid="ignore"):  # NaN is rejected with its name
         return facets["numbers"][:, 3:].reshape(-1, 3).astype(np.float64)
 
 
 def _capsule(link: int, points: FloatArray) -> Capsule:
-    """The slimmest capsule around points (k, 3) of those along the coordinate axes and the longest extent."""
+    """The slimmest capsule around points (k, 3), among those along the coordinate axes and the longest extent."""
     middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
     spread = points - middle
     longest = np.linalg.eigh(spread.T @ spread)[1][:, -1]
@@ -364,15 +364,15 @@ def _capsule(link: int, points: FloatArray) -> Capsule:
 
 
 # -- the chain -----------------------------------------------------------------------------------------------
-# The joints of a URDF's tree that are the arm: the way from its root to the flange, and what is left out of it.
+# The joints of a URDF's tree that form the arm: the chain from root to flange, and the omitted joints.
 
 
 JAW = re.compile(r"gripper|jaw|finger|claw|pinch|grasp|thumb|knuckle", re.IGNORECASE)
-"""In the name of a last joint that opens and closes something, unless it is one of `TURNS`."""
+"""Pattern of names of a gripper's joint at the end of a chain, unless the name matches `TURNS`."""
 TURNS = re.compile(r"roll|pitch|yaw|rot|wrist|turn|swivel|spin", re.IGNORECASE)
 JAW_LINK = re.compile(r"jaw|finger|claw|thumb|moving", re.IGNORECASE)
 TOOL_FRAME = re.compile(r"tool0|tcp|gripper_frame|grasp|end_?effector|(?:^|_)eef?(?:_|$)", re.IGNORECASE)
-"""In the name of a link that is fixed before the last joint: the arm ends there."""
+"""Pattern of names of links fixed before the last joint at which the arm ends."""
 MOST_NAMES = 8
 
 
@@ -382,7 +382,7 @@ class UrdfError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class UrdfJoint:
-    """A joint of a URDF: ``origin`` (4, 4) in its parent, ``axis`` (3,), ``mimics``: which joint it is coupled to."""
+    """A joint of a URDF: ``origin`` (4, 4) in its parent, ``axis`` (3,), ``mimics``: the joint it is coupled to."""
 
     name: str
     kind: str
@@ -395,17 +395,17 @@ class UrdfJoint:
 
     @property
     def moves(self) -> bool:
-        """Whether it moves, by itself or coupled to another."""
+        """Whether it moves, independently or coupled to another."""
         return self.kind != "fixed"
 
     @property
     def driven(self) -> bool:
-        """Whether it moves by itself."""
+        """Whether it moves independently."""
         return self.moves and not self.mimics
 
 
 class UrdfTree:
-    """Links and joints of a URDF file, checked to be a tree, or several. Raises UrdfError."""
+    """Links and joints of a URDF file, checked to form one tree or several. Raises UrdfError."""
 
     def __init__(self, path: Path, name: str, links: dict[str, Element], joints: tuple[UrdfJoint, ...]) -> None:
         self.path, self.name, self.links, self.joints = path, name, links, joints
@@ -450,7 +450,7 @@ class UrdfTree:
         return joint.moves or self._moving[joint.child]
 
     def depth(self, joint: UrdfJoint) -> int:
-        """How many joints that are driven follow one another from this one on, at most."""
+        """Largest number of driven joints in series from this joint on."""
         return joint.driven + self._depth[joint.child]
 
     def beyond(self, joint: UrdfJoint) -> list[UrdfJoint]:
@@ -462,9 +462,9 @@ class UrdfTree:
 
 
 def chain_to_flange(tree: UrdfTree, flange: str) -> tuple[list[UrdfJoint], tuple[str, ...]]:
-    """Joints from the root to the link ``flange``, fixed ones included, and notes on what is left out and how it is
-    included. ``flange`` empty: the last link before nothing moves any more, before a gripper, or where the tree
-    branches. Raises UrdfError: no joint moves, one is coupled to another, or it is open which of several arms is meant.
+    """Joints from the root to the link ``flange``, fixed ones included, and notes on what is omitted and how it is
+    included. ``flange`` empty: the last moving link, or the last before a gripper or a branch of the tree. Raises
+    UrdfError if no joint moves, one is coupled to another, or several arms are possible.
     """
     left = _LeftOut()
     if flange:
@@ -497,7 +497,7 @@ def chain_to_flange(tree: UrdfTree, flange: str) -> tuple[list[UrdfJoint], tuple
 
 @dataclass
 class _LeftOut:
-    """Notes on joints that are left out, and which these are."""
+    """The omitted joints, with notes on them."""
 
     notes: list[str] = field(default_factory=list)
     joints: set[str] = field(default_factory=set)
@@ -519,7 +519,7 @@ def _found(tree: UrdfTree, link: str, left: _LeftOut) -> list[UrdfJoint]:
     else:
         chain = _without_jaw(tree, chain, left)
         link = chain[-1].child if chain else link
-    ahead = tree.below(link)  # a tool's frame behind the last joint, where it is the only one
+    ahead = tree.below(link)  # a tool's frame behind the last joint, if it is the only one
     while len(ahead) == 1 and not ahead[0].moves:
         chain.append(ahead[0])
         ahead = tree.below(ahead[0].child)
@@ -529,9 +529,10 @@ def _found(tree: UrdfTree, link: str, left: _LeftOut) -> list[UrdfJoint]:
 def _onward(
     tree: UrdfTree, link: str, moving: list[UrdfJoint], chain: list[UrdfJoint], left: _LeftOut
 ) -> list[UrdfJoint]:
-    """The one joint with which the arm goes on from ``link``, where it branches; none: it ends there, by a gripper.
+    """The one joint with which the arm continues from ``link``, where the tree branches; None if the arm ends there.
 
-    Linkages that are coupled to the arm's own joints are no branch. Raises UrdfError where several arms begin there.
+    The arm ends at a gripper. Linkages coupled to the arm's own joints are no branch. Raises UrdfError if several arms
+    begin there.
     """
     own = {joint.name for joint in chain}
     branches = [joint for joint in moving if not all(one.mimics in own for one in tree.beyond(joint) if one.moves)]
@@ -550,7 +551,7 @@ def _onward(
         )
         return []
     driven = [joint for joint in branches if tree.depth(joint)]
-    if len(driven) == 1:  # beside the arm, linkages coupled to joints further on
+    if len(driven) == 1:  # others are linkages coupled to joints further on
         return driven
     ends = []
     for joint in sorted(driven, key=tree.depth, reverse=True)[:MOST_NAMES]:
@@ -566,7 +567,7 @@ def _onward(
 
 
 def _without_jaw(tree: UrdfTree, chain: list[UrdfJoint], left: _LeftOut) -> list[UrdfJoint]:
-    """A chain up to a gripper's single jaw at its end."""
+    """A chain without a gripper's single jaw at its end."""
     last = next((k for k in reversed(range(len(chain))) if chain[k].driven), 0)
     jaw = chain[last] if chain else None
     coupled = [joint for joint in chain[last + 1 :] if joint.mimics]
@@ -590,7 +591,7 @@ def _without_jaw(tree: UrdfTree, chain: list[UrdfJoint], left: _LeftOut) -> list
 
 
 def _tell_beside(tree: UrdfTree, chain: list[UrdfJoint], left: _LeftOut) -> None:
-    """Tell of joints beside the chain of which no other note tells."""
+    """Add notes on joints beside the chain that no other note covers."""
     told = left.joints | {joint.name for joint in chain}
     own = {joint.name for joint in chain}
     others = [one for one in tree.joints if one.moves and one.name not in told]

@@ -1,5 +1,5 @@
-"""The six virtual joints of an arm that takes Cartesian velocities, as a serial arm of its own: the truth of what the
-cell sees, where the arm's controller does as it is told.
+"""The six virtual joints of an arm driven by Cartesian velocities, as a serial arm: ground truth of the cell if the
+arm's controller follows its commands exactly.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 
 TO_NEXT = np.eye(4)[:, [1, 2, 0, 3]]
-"""(4, 4): z along what was x, so that x, y, z come in turn. From the base to the first virtual joint's frame."""
+"""Rotation (4, 4) whose z axis is the previous x, so that x, y, z come in turn; base to first virtual joint's frame."""
 
 
 def virtual_links(attitude: FloatArray) -> FloatArray:
@@ -41,5 +41,5 @@ def virtual_cell(
     joints: tuple[JointSpec, ...],
     base: FloatArray,
 ) -> SimulatedCell:
-    """``cell`` with its arm as six virtual ``joints``, laid out around ``base`` (6,)."""
+    """``cell`` with its arm replaced by six virtual ``joints``, laid out around ``base`` (6,)."""
     return replace(cell, robot=virtual_robot(cell.robot, tool, attitude, joints), base=base)
