@@ -115,9 +115,7 @@ class ProjectiveChain:
         return jacobian
 
     def image_jacobian(self, Ps: FloatArray, q: FloatArray, M_now: FloatArray) -> FloatArray:
-        """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3,
-        4)`` (8.33).
-        """
+        """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3, 4)`` (8.33)."""
         J_H = self.point_jacobian(q, M_now)
         jacobian: FloatArray = np.einsum("cmik,mkj->cmij", projection_jacobian_many(Ps, M_now), J_H)
         return jacobian

@@ -31,9 +31,7 @@ class Composition(IntEnum):
 
 
 class PresentArm(NamedTuple):
-    """An arm at its current configuration: its ``operators`` (n, 4, 4) there (5.21) and their ``composition``, a
-    `Composition`.
-    """
+    """An arm at its current configuration: its ``operators`` (n, 4, 4) there (5.21), and their `Composition`."""
 
     operators: FloatArray
     composition: int
@@ -109,8 +107,9 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
 
 
 def displacement_basis(projective_to_euclidean: FloatArray, points: FloatArray) -> FloatArray:
-    """Twists (6, 4, 4): translations along three axes, then rotations about them through the centroid of ``points`` (m,
-    4). The unit of translation is the largest distance of a point from the centroid, so all six are of similar size.
+    """Twists (6, 4, 4): translations along three axes, then rotations about them through the centroid of ``points``
+    (m, 4). The unit of translation is the largest distance of a point from the centroid, so all six are of similar
+    size.
     """
     H = np.asarray(projective_to_euclidean, dtype=np.float64)
     euclidean = points @ H.T

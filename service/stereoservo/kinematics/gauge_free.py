@@ -126,7 +126,7 @@ class Group:
 
 
 def sights(model: CellModel, parts: FramedModel) -> Group:
-    """Quantities of the markers' images: raw pixels of the central marker at the zero, and its motion by each joint
+    """Quantities of the markers' images: raw pixels of the central marker at the zero, its motion by each joint
     (5.38).
     """
     marker = _middle_marker(parts)
@@ -309,9 +309,7 @@ def _turning_plane(G: FloatArray) -> FloatArray:
 
 
 def _parallel_axes(model: CellModel, parts: FramedModel) -> list[Group]:
-    """Quantities of three successive parallel revolute axes: ratio of their distances, and the angle at the middle
-    one.
-    """
+    """Quantities of three successive parallel revolute axes: ratio of distances, and the angle at the middle one."""
     turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
     groups = []
     for three in zip(turns, turns[1:], turns[2:], strict=False):
@@ -388,8 +386,8 @@ def _vergence(model: CellModel, c: int) -> Group:
 
 
 def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]:
-    """Quantities: angles between successive axes; for nearly parallel revolute axes the two small signed angles of
-    Hayati.
+    """Quantities: angles between successive axes; for nearly parallel revolute axes Hayati's two small signed
+    angles.
     """
     two = [link.link == "parallel" and kind == "revolute" for link, kind in zip(links, model.joint_kinds, strict=True)]
     names: list[tuple[str, str]] = []
@@ -430,9 +428,7 @@ def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
 
 
 def _named_lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]) -> list[tuple[str, bool]]:
-    """Name of each measured length and whether it belongs to the arm; the name is empty if a convention sets the
-    length.
-    """
+    """Name of each measured length and whether it belongs to the arm; the name is empty if a convention sets it."""
     chosen_of = chosen_columns(axes_at_origin(parts), links)
     names: list[tuple[str, bool]] = []
     for j, joint in enumerate(model.joint_names):

@@ -123,9 +123,9 @@ class JointProblem:
         return self.measurements - self.seen.chain.joints
 
     def moved(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives with respect to the joints (s, k, c, m,
-        3, n) at configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether all points lie in front of the
-        cameras that see them (s,).
+        """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives with respect to the joints
+        (s, k, c, m, 3, n) at configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether all points lie in front
+        of the cameras that see them (s,).
         """
         s, n = q.shape
         k = len(self.offsets)

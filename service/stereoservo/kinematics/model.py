@@ -592,7 +592,7 @@ class ShutterOffset(msgspec.Struct, frozen=True):
 
 
 def offset_faults(offsets: Sequence[ShutterOffset], cameras: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Faults of the offsets of a model's ``cameras`` as ``(key, fault)``: each must name one of these, once, and be
+    """Faults of the offsets of a model's ``cameras`` as ``(key, fault)``: each names one of these, once, and is
     bounded.
     """
     for k, offset in enumerate(offsets):

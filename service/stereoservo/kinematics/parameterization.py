@@ -128,9 +128,7 @@ def lens_model_of(lenses: FloatArray) -> LensModel:
 
 
 def point_bases(points: FloatArray, stratum: Stratum) -> FloatArray:
-    """Directions (m, 3, 4) of points (m, 4): all but their scale, or the three finite coordinates of affine
-    strata.
-    """
+    """Directions (m, 3, 4) of points (m, 4): all but their scale, or the three finite coordinates if affine."""
     if stratum != "projective":
         return np.tile(np.eye(4)[:3], (len(points), 1, 1))
     return np.asarray(np.linalg.svd(points[:, None, :])[2][:, 1:])

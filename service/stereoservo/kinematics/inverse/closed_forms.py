@@ -14,7 +14,7 @@ from stereoservo.geometry.displacements import exp_rotation, exp_translation
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 FREE = 1e-9
-"""Radius of a joint's circle, relative to the largest motion by its operator, below which the joint does not move the
+"""Radius of a joint's circle, relative to its operator's largest motion, below which the joint does not move the
 point.
 """
 
@@ -39,8 +39,8 @@ def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
 
 
 def beside(first: Branches, second: Branches) -> Branches:
-    """Branches with the joints of ``second`` appended to those of ``first``; a single candidate is combined with all of
-    the other.
+    """Branches with the joints of ``second`` appended to those of ``first``; a single candidate is combined with all
+    others.
     """
     k = max(len(first.steps), len(second.steps))
 

@@ -20,9 +20,7 @@ FEWEST = 128
 MOST = 4096
 """Number of starts of a search: per batch, at least, at most."""
 HITS = 8
-"""Number of starts that must converge to each solution before a search ends: other solutions are likely missing
-before.
-"""
+"""Number of starts that must converge to each solution before a search ends, so that few solutions are missed."""
 TWINS = np.array([0.05, 0.2, 0.6])
 """Steps [rad] from a solution along its weakest direction, where the other solution of a close pair lies."""
 POLISH = 1e-9
@@ -121,8 +119,8 @@ class _Known:
         self.hits: list[int] = []
 
     def add(self, ends: FloatArray, left: FloatArray, count: int) -> list[int]:
-        """Add those of ``ends`` (s, n) that solve the problem, each with ``count`` hits; returns the indices of new
-        ones.
+        """Add those of ``ends`` (s, n) that solve the problem, each with ``count`` hits; returns the new ones'
+        indices.
         """
         fresh = []
         solved = left <= self.tolerance
@@ -364,9 +362,7 @@ def descended(
     iterations: int = ITERATIONS,
     damping: float = 1e-2,
 ) -> tuple[FloatArray, FloatArray]:
-    """Run `descend` on ``chain``: end points (s, n) and their residuals (s,), ``|H(q)M - M*| / |M*|`` over all
-    points.
-    """
+    """Run `descend` on ``chain``: end points (s, n) and residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
     ends, errors = descend(
         Chain(chain.generators, chain.kind_codes, chain.zero, chain.tip_first),
         np.ascontiguousarray(points, dtype=np.float64),

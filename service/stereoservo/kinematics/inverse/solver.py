@@ -92,9 +92,9 @@ def inverse_kinematics(
 ) -> InverseSolutions:
     """Inverse kinematics: all configurations that reach a goal.
 
-    The goal is a ``displacement`` (4, 4) from the chain's zero, of any scale, or ``targets`` (m, 4) of ``points`` (m,
-    4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions; joints that the goal does not
-    determine stay there. ``limits`` (n, 2) [rad or m]; required for prismatic joints if there is no closed form.
+    The goal is a ``displacement`` (4, 4) from the chain's zero, of any scale, or ``targets`` (m, 4) of ``points``
+    (m, 4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions; joints that the goal does
+    not determine stay there. ``limits`` (n, 2) [rad or m]; required for prismatic joints if there is no closed form.
     ``tolerance``: residual up to which a goal counts as reached; for measured goals it must correspond to their noise.
     ``recognition``: of this arm, if already known (for a model with a covariance it takes a second).
 
