@@ -28,9 +28,7 @@ OPERATOR_WEIGHT = 1e-3
 convention, operators are measured.
 """
 PRISMATIC = 1e-12
-"""Squared rotation rate relative to the squared norm of the operator's block below which a joint counts as
-prismatic.
-"""
+"""Squared rotation rate, relative to the operator block's squared norm, below which a joint counts as prismatic."""
 AVERAGED = 5
 """Number of angles over which a form is averaged: it is of second degree in sine and cosine, so five are exact."""
 INVERSE_ITERATIONS = 3
@@ -45,9 +43,7 @@ DECAY = 4.0
 HANDS_OVER, ENDS = 0.3, 0.7
 """Path parameters at which a component that moves first begins to slow down, and ends."""
 NUMBERS = 17
-"""Numbers that describe a path: hinge (4), planar rotation (4), translation (3), bend (3), profiles of the three
-(3).
-"""
+"""Numbers of a path: hinge (4), planar rotation (4), translation (3), bend (3), profiles of the three (3)."""
 
 
 @kernel
@@ -99,7 +95,7 @@ def conjugate_all(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
 
 @kernel
 def average_over_turns(form: FloatArray, generator: FloatArray) -> None:
-    """Average a quadratic ``form`` (k, k), in place, over all rotations by a ``generator`` (k, k) of eigenvalues 0,
+    """Average a quadratic ``form`` (k, k), in place, over the rotations by a ``generator`` (k, k) of eigenvalues 0,
     ±i.
     """
     size = form.shape[0]

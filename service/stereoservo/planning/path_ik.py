@@ -278,9 +278,7 @@ def pixel_distance(
 
 @kernel
 def _points_on_path(path: FloatArray, path_parameter: float, body: FloatArray, residual: FloatArray) -> FloatArray:
-    """Required points (m, 3) of the body on the path, including the path parameter's fraction of the ``residual`` (m,
-    3).
-    """
+    """Required points (m, 3) of the body on the path, with the proportional part of the ``residual`` (m, 3)."""
     points = moved(pose_on_path(path, path_parameter), body)
     for p in range(points.shape[0]):
         for i in range(3):

@@ -255,9 +255,7 @@ def go_to_posture(planning: Planning) -> None:
 
 
 def _next_seed(p: Planning) -> None:
-    """Find the joints at the goal from the next seed; if they are within the limits, the straight line to them is tried
-    next.
-    """
+    """Find the joints at the goal from the next seed; if within the limits, the straight line to them is tried next."""
     if p.seeds >= SEEDS:
         _give_up(p)
         return
@@ -325,8 +323,8 @@ def start_arm(planning: Planning, stage: Stage) -> None:
 
 
 def _samples(p: Planning, until: int) -> tuple[int, int]:
-    """Evaluate samples of the current stage before ``until``; returns the kind of the violated limit or −1, and the
-    last sample.
+    """Evaluate samples of the current stage before ``until``; returns the kind of violated limit or −1, and the last
+    sample.
     """
     unconstrained = p.stage == Stage.UNCONSTRAINED_IK
     # an arm with missing degrees of freedom leaves the path between its ends
@@ -424,9 +422,7 @@ def _distance_in_posture(
 
 
 def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
-    """Continue with the nearer of the joints at the end of the requested path and those of a direct step to the
-    goal.
-    """
+    """Continue with the nearer of the joints at the requested path's end and those of a direct step to the goal."""
     start, s = writable_copy(p.request.joints), p.constraints
     found, table = [], empty_table()
     if not missed:
@@ -494,9 +490,7 @@ def _finish(p: Planning) -> None:
 def _in_time(
     joints: FloatArray, displacements: FloatArray, frame: FloatArray, inverse: FloatArray, pace: JointPace
 ) -> tuple[FloatArray, FloatArray]:
-    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) transformed out of the motion
-    ``frame``.
-    """
+    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) outside the motion ``frame``."""
     times = sample_times(joints, pace.velocity_max, pace.acceleration_max, pace.even)
     return times, conjugate_all(frame, displacements, inverse)
 
@@ -506,9 +500,7 @@ def _straight(candidate: Candidate) -> bool:
 
 
 def _missing_freedom(p: Planning) -> float:
-    """Index of the component in `MISSING_FREEDOMS` that contributes most to the distance of the body from its pose on
-    the path.
-    """
+    """Index in `MISSING_FREEDOMS` of the largest component of the body's distance from its pose on the path."""
     body = p.constraints.body
     required = p.goal
     if p.stage != Stage.STRAIGHT_IN_JOINTS:
@@ -558,9 +550,7 @@ def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
 
 
 def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Profile shapes for components of ``amounts``; linear if all components that move have the same shape, so none
-    waits.
-    """
+    """Profile shapes for components of ``amounts``; linear if all moving components have the same shape."""
     own = SHAPES[profile]
     at_work = {shape for shape, amount in zip(own, amounts, strict=True) if amount != 0.0}
     if profile == "exponential" or len(at_work) > 1:
@@ -623,18 +613,14 @@ ROUNDS = 12
 LOOKS = 4
 """Number of points in an interval at which its rates are checked."""
 VELOCITY_EXCESS, ACCELERATION_EXCESS = 1.01, 1.25
-"""Largest velocities and accelerations of the cubics between samples, relative to the limits; accelerations are means
-over an interval.
-"""
+"""Largest velocity and mean acceleration in an interval of the cubics between samples, relative to the limits."""
 
 
 @kernel
 def _next_paces(
     slope: FloatArray, bow: FloatArray, limits: FloatArray, pace: float, ceiling: float
 ) -> tuple[float, float]:
-    """Least and largest pace after an interval that begins with ``pace``; there is none if the first exceeds the
-    second.
-    """
+    """Least and largest pace after an interval that begins with ``pace``; none if the first exceeds the second."""
     least, largest = 0.0, ceiling
     for j in range(slope.shape[0]):
         if not math.isfinite(limits[j]):

@@ -53,9 +53,7 @@ class NotReachableError(Exception):
 
 
 class DegenerateStepError(Exception):
-    """The points or planes do not define a unique motion: the centre is on target, the faces are coplanar. ``what``:
-    the cause.
-    """
+    """The points or planes do not define a unique motion: centre on target, coplanar faces. ``what``: the cause."""
 
     def __init__(self, what: str) -> None:
         super().__init__(what)

@@ -38,9 +38,7 @@ VISIBILITY_SHARE = 0.9
 
 
 class ComponentStatus(IntEnum):
-    """Status of a component: it moves, is done, cannot be made by the arm, waits for visibility, or there is no
-    face.
-    """
+    """Status of a component: it moves, is done, cannot be made by the arm, waits for visibility, or has no face."""
 
     MOVES = 0
     DONE = 1

@@ -18,9 +18,7 @@ FOLLOWS = 0.5
 
 
 FADE_S = 0.5
-"""Time before the end of a plan [s] over which the weight of its joints fades out, so that only the images count at
-rest.
-"""
+"""Time before a plan's end [s] over which the weight of its joints fades out, so that only the images count at rest."""
 
 
 class PlanSample(NamedTuple):
@@ -46,7 +44,7 @@ class PlannedJoints(NamedTuple):
 
 @kernel
 def _pace_at(times: FloatArray, k: int) -> float:
-    """Samples per second at sample ``k``: the mean of two adjacent paces is the inverse of the time between
+    """Samples per second at sample ``k``: the mean of two adjacent ones is the inverse of the time between
     (`sample_times`).
     """
     before = 0.0

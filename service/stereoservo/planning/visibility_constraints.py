@@ -38,9 +38,7 @@ ROUNDING = 1e-9
 GRAZING = math.radians(3.0)
 """Least elevation of a camera over a face that must stay visible, unless the ends of the path have less."""
 THICK = 0.05
-"""Distance of a body's centroid from a face, relative to the body's size, from which on it determines the face's
-outside.
-"""
+"""Distance of a body's centroid from a face, relative to the body's size, that determines the outside of the face."""
 YIELD_PX, YIELD_ANGLE = 0.02, 1e-4
 """Amount by which reduced margins are below the clearance at the ends [px], [rad]: more than the arm's error there."""
 
@@ -340,7 +338,7 @@ def _elevations(points: FloatArray, faces: IntArray, camera_centres: FloatArray)
 def _required_visibility(
     body: FloatArray, goal: FloatArray, faces: IntArray, camera_centres: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sides (f, c) of the faces and least elevations (f, c) [rad]; side 0 if a camera does not see the face at both
+    """Sides (f, c) of the faces, least elevations (f, c) [rad]; side 0 if a camera does not see the face at both
     ends.
     """
     cameras = camera_centres.shape[0]
@@ -381,9 +379,7 @@ def _extent(body: FloatArray) -> tuple[FloatArray, float]:
 
 @kernel
 def _outside(body: FloatArray, face: IntArray, centroid: FloatArray, size: float) -> float:
-    """Sign of a face's plane outside a body of given ``centroid`` (3,) and ``size``; 0 if all markers lie in the
-    plane.
-    """
+    """Sign of a face's plane outside a body of given ``centroid`` (3,) and ``size``; 0 if all markers lie in it."""
     a = body[face[0]]
     u, v = body[face[1]] - a, body[face[2]] - a
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])
