@@ -55,9 +55,7 @@ def kernel(function: _F) -> _F:
 
 
 def inlined_kernel(function: _F) -> _F:
-    """A :func:`kernel` that is compiled into each kernel that calls it: for inner loops, in which the call overhead
-    matters.
-    """
+    """A :func:`kernel` that is compiled into each kernel that calls it: for inner loops with relevant call overhead."""
     return _compile(function, inline="always")
 
 
@@ -107,9 +105,7 @@ def _compile(function: _F, **more: Any) -> _F:
 
 
 def _forget_literals(dispatcher: Any) -> None:
-    """Make the lookup of calls by other kernels depend on the types of their arguments only, not on the values of
-    literals.
-    """
+    """Make the lookup of calls by other kernels depend only on the argument types, not on the values of literals."""
     template, unliteral = dispatcher.get_call_template, cast(Any, types).unliteral
 
     def get_call_template(args: Any, kws: Any) -> Any:

@@ -20,7 +20,7 @@ PIVOT_TOLERANCE = 1e-14
 SWEEPS = 40
 ORTHOGONAL = 1e-15
 NEGLIGIBLE = 1e-17
-"""One-sided Jacobi: columns are orthogonal below this cosine; a column below this fraction of the matrix is
+"""One-sided Jacobi: columns are orthogonal below this cosine; columns below this fraction of the matrix are
 rounding.
 """
 
