@@ -372,9 +372,7 @@ class Detector(Protocol):
         ...
 
     def detect(self, frame: Frame, prior: Prior | None) -> CameraObservation:
-        """Markers in ``frame``; without a (fresh) prior, acquisition in the whole image. Never raises because of the
-        image content.
-        """
+        """Markers in ``frame``; without a (fresh) prior, acquisition in the whole image. Never raises on content."""
         ...
 
 

@@ -23,9 +23,7 @@ class FoundCamera(msgspec.Struct, frozen=True):
 
 
 class FoundBus(msgspec.Struct, frozen=True):
-    """An adapter or serial port to which a bus of drives may be connected: its display name, and the driver's
-    options.
-    """
+    """An adapter or serial port that may lead to a bus of drives: its display name, and the driver's options."""
 
     name: str
     options: dict[str, Any]
@@ -77,9 +75,7 @@ class CameraFinder(Protocol):
 
     @classmethod
     def find_cameras(cls) -> tuple[FoundCamera, ...]:
-        """Cameras of this computer; network cameras are not searched for. A camera is opened only briefly, for a
-        query.
-        """
+        """Cameras of this computer; network cameras are not searched for. Cameras are opened only briefly."""
         ...
 
     @classmethod

@@ -95,9 +95,7 @@ class ImageEnd(msgspec.Struct, frozen=True, tag="end", tag_field="line"):
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """Limits at which a recording ends: size of the video, time between first and last frame, disk space to keep
-    free.
-    """
+    """Limits of a recording: size of the video, time between first and last frame, disk space to keep free."""
 
     max_bytes: int = 64 * GIB
     max_seconds: float = 4 * 3600.0
@@ -151,8 +149,8 @@ class ImageWriter:
         driver: str = "",
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> None:
-        """``size``: width, height [px]. Raises ImageFileError (``exists``, ``disk``, ``codec``); does not create
-        directories.
+        """``size``: width, height [px]. Raises ImageFileError (``exists``, ``disk``, ``codec``); creates no
+        directory.
         """
         self.path = video
         self.frames = 0

@@ -448,7 +448,7 @@ def _stored_pictures(
 
 
 def _cells(folder: Path, path: Path, key: str, position: int) -> tuple[Iterator[Any], int]:
-    """Cells of a column, starting at the row group that contains the row ``position``, and the position of the first
+    """Cells of a column from the row group that contains the row ``position`` on, and the position of the first
     cell.
     """
     with _reading(path):
