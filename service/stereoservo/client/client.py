@@ -277,9 +277,7 @@ class Client(Connection):
         *,
         lease_s: float | None = 5.0,
     ) -> CheckReport:
-        """Run a short check motion and test whether the model in use is still valid. Raises RefusedError,
-        FailedError.
-        """
+        """Run a short check motion and test whether the model is still valid. Raises RefusedError, FailedError."""
         return check_model(self, progress, timeout_s, lease_s)
 
     def reset_zeros(
@@ -336,9 +334,7 @@ class Client(Connection):
 
 
 def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple[str, Any, type[Any]]]:
-    """Messages (key, payload, kind), the oldest first, without the marker messages that are not the last of their
-    key.
-    """
+    """Messages (key, payload, kind), the oldest first; of the marker messages only the last of each key."""
     last = {key: k for k, (key, _, _) in enumerate(arrived)}
     return [
         (key, payload, kind)

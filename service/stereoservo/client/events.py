@@ -19,9 +19,7 @@ ALIVE_EVERY_S = 1.0
 
 
 class EventWatch:
-    """Events from the time of construction on, in order and without gaps: events that the subscription lost are
-    queried.
-    """
+    """Events since construction, in order and without gaps: events that the subscription lost are queried."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
