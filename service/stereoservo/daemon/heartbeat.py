@@ -19,9 +19,7 @@ HEARTBEAT_BYTES = _RECORD.size
 BEAT_EVERY_NS = 20_000_000
 
 SILENT_S = 0.5
-"""Shortest silence that is reported [s]: a process beats every 20 ms, and a shorter silence may be a stall of the
-machine.
-"""
+"""Shortest reported silence [s]: a process beats every 20 ms; a shorter silence may be a stall of the machine."""
 SERVO_HANG_S = 2.0
 """Time limit of the servo process [s]. Without its commands the drives stop within 0.5 s, and the core recovers from
 stalls of a shared machine of up to a second (LOOP_GAP). After a longer stall the process cannot be trusted.
@@ -29,9 +27,7 @@ stalls of a shared machine of up to a second (LOOP_GAP). After a longer stall th
 DRIVER_CALL_S = 15.0
 """Time limit while drives are reconnected, configured and enabled [s]: the gateway waits 10 s for it."""
 PLANT_HANG_S = 2.0
-"""Time limit of the plant [s]. Without samples the core brakes and holds; it recovers from a stall of a shared
-machine.
-"""
+"""Time limit of the plant [s]. Without samples the core brakes and holds; it recovers from a machine's stall."""
 GATEWAY_HANG_S = 5.0
 """Time limit of the gateway [s]. It is not critical, because the arm is held after 0.5 s of silence; the gateway's
 disks may be slow.

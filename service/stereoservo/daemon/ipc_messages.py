@@ -266,8 +266,8 @@ _OBSERVATION, _PRIOR = struct.Struct("<IIqqq"), struct.Struct("<IIq")
 follow, each aligned to 8 bytes.
 """
 _STEP = struct.Struct("<IIq")
-"""Head of a step in the ring: mark, steps lost before it, time. Other messages are msgpack, which cannot begin with the
-mark.
+"""Head of a step in the ring: mark, steps lost before it, time. Other messages are msgpack, which never begins with
+it.
 """
 _STEP_MARK = 0xC1C1C1C1  # a byte that msgpack never uses
 received_decoder = msgspec.msgpack.Decoder(Received)

@@ -187,9 +187,7 @@ def _warm_up_goals() -> None:
 
 
 def _warm_up_agreement() -> None:
-    """Run a core that reaches a goal with a model of stated accuracy: only then is the agreement of the cameras
-    checked.
-    """
+    """Run a core that reaches a goal with a model of stated accuracy: only then is the cameras' agreement checked."""
     plain, settings = example_model(), example_settings()
     pixels = _example_pixels(plain)
     matrices, lenses = [c.matrix for c in plain.cameras], [np.ones_like(c.lens) for c in plain.cameras]
@@ -384,7 +382,7 @@ class _Compiled(NamedTuple):
 
 
 class ShippedRecord(NamedTuple):
-    """Content of ``compiled.pickle`` of the installed kernels: versions of the compiler, source hashes by module,
+    """Content of ``compiled.pickle`` of the installed kernels: compiler versions, source hashes by module,
     signatures.
     """
 
@@ -450,8 +448,8 @@ def _lock_path() -> Path:
 
 
 def compiled() -> tuple[Overload, ...] | None:
-    """The signatures of all kernels, if all are in the cache or installed, for the current sources and this computer;
-    else None.
+    """The signatures of all kernels, if all are cached or installed for the current sources and this computer; else
+    None.
     """
     found = _cached_overloads()
     if found is None:

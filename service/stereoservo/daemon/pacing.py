@@ -39,9 +39,7 @@ class Histogram:
         self.maximum = max(self.maximum, value)
 
     def quantile(self, fraction: float) -> float:
-        """Quantile: value that ``fraction`` of the counted values do not exceed (upper edge of its bin, at most the
-        maximum).
-        """
+        """Value that ``fraction`` of the counted values do not exceed (upper edge of its bin, at most the maximum)."""
         if not self.count:
             return 0.0
         rank = fraction * self.count
@@ -128,9 +126,7 @@ class ClockPacing:
 
 
 CYCLE_LOG_VARIABLE = "STEREOSERVO_CYCLE_LOG"
-"""Environment variable: a file of zeros in which the loop logs its cycles: their number, then four 64-bit words
-each.
-"""
+"""Environment variable: file of zeros in which the loop logs its cycles: their number, then four 64-bit words each."""
 _CYCLE = struct.Struct("=4q")
 CYCLE_BYTES = _CYCLE.size
 

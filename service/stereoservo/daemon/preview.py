@@ -144,9 +144,7 @@ class PreviewRequest:
         self._wanted.write(struct.pack("=q", time.monotonic_ns() + int(WANTED_S * 1e9)))
 
     def poll(self) -> PreviewPicture | None:
-        """The newest image, unless it was returned before or is older than `WANTED_S`. Raises the decoder's
-        exceptions.
-        """
+        """The newest image, unless returned before or older than `WANTED_S`. Raises the decoder's exceptions."""
         data = self._slot.poll()
         if data is None:
             return None

@@ -114,8 +114,8 @@ class RingReader:
         return found
 
     def _record(self, at: int, end: int) -> tuple[bytes | None, int]:
-        """The record at position ``at`` (None for a jump to the beginning), and the position of the next one; -1 if it
-        is invalid.
+        """The record at position ``at`` (None for a jump to the beginning), and the next position; -1 if it is
+        invalid.
         """
         place = at % self._capacity
         if at % 8 or not 0 < end - at <= self._capacity:

@@ -258,9 +258,7 @@ def create_stop_slot(path: Path) -> None:
 
 
 def repair_stop_slot(path: Path) -> bool:
-    """Restore the magic number of a damaged stop slot without changing its other words; returns whether that was
-    needed.
-    """
+    """Restore the magic number of a damaged stop slot, its other words unchanged; returns whether that was needed."""
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         mark = struct.pack("=Q", _STOP_MAGIC)

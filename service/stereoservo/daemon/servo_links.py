@@ -38,9 +38,7 @@ NOTHING_WAITS = GatewayMessages(False, (), None)
 
 
 class _RecorderPeer:
-    """A reader of the ring of step records, as a `StepSink`; messages that are too large for the ring are not
-    accepted.
-    """
+    """A reader of the ring of step records, as a `StepSink`; messages too large for the ring are not accepted."""
 
     def __init__(self, ring: RingWriter, reader: int) -> None:
         self._ring = ring
@@ -104,9 +102,7 @@ class ProcessLinks:
         return found
 
     def observations(self) -> tuple[CameraObservation, ...]:
-        """The newest observation of each camera, unless it was returned before; records that cannot be decoded are
-        skipped.
-        """
+        """The newest observation of each camera, unless returned before; records that cannot be decoded are skipped."""
         found = []
         for reader, boundary in self._observations:
             data = reader.poll()

@@ -67,8 +67,8 @@ FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 10.0
 WATCH_EVERY_S = 0.05
 LATE_S = 0.25
-"""Delay of the supervisor's check [s] above which it was itself without a processor: the silence of a process does not
-count then.
+"""Delay of the supervisor's check [s] above which it was itself stalled: the silence of a process does not count
+then.
 """
 AFTER_SERVO = (
     "The drives stop by themselves without its commands. See what it logged last, and `stereoservo doctor` on the "

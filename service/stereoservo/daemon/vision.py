@@ -63,9 +63,7 @@ LONGEST_PAUSE_S = 5.0
 SILENT_CAMERA_S = 2.0
 """Time without data after which a camera is closed and reopened [s]."""
 QUIET_PERIODS = 0.6
-"""Fraction of a camera's period after a frame in which it is not polled: an earlier frame is received a little
-later.
-"""
+"""Fraction of a camera's period after a frame without polling: an earlier frame is received a little later."""
 LOOKS = 2
 """Number of unsuccessful polls per frame above which polling for the next frame starts later."""
 PRIOR_MAX_AGE_S = 0.5

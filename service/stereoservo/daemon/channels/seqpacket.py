@@ -201,9 +201,7 @@ class Outbox:
         self._kept.append((number, data))
 
     def resume(self, number: int) -> None:
-        """Continue over a new connection: the receiver has the messages up to ``number``, later ones are sent
-        (again).
-        """
+        """Continue over a new connection: the receiver has the messages up to ``number``, later ones are sent."""
         self._sent = number
 
     def release(self, number: int) -> None:

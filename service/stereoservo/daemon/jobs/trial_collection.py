@@ -15,7 +15,7 @@ from stereoservo.kinematics.model import JointLoads
 LEAST_NOISE = 1e-9
 """Fraction of a variance below which noise is only the rounding error of a difference."""
 MOST_NOISE = 3.0
-"""Stated variance of a single observation, relative to the median over all stops, above which it states more than
+"""Stated variance of one observation, relative to the median over all stops, above which it includes more than
 noise.
 """
 
