@@ -1,7 +1,7 @@
 """Goal client for one cell: sends goals and commands, runs calibrations and model checks, and subscribes to states,
 events and features.
 
-Every call either succeeds or raises; "no reply" means refused.
+Every call either succeeds or raises; a missing reply counts as a refusal.
 """
 
 from __future__ import annotations
@@ -62,19 +62,19 @@ from stereoservo.messages.wire import (
 )
 
 DRAIN = 32
-"""Messages of a kind in one look: events that a caller causes do not starve the others."""
+"""Largest number of messages of one kind per poll, so that events caused by the caller do not starve the others."""
 GOAL_TIMEOUT_S = 7.0
-"""A goal is planned before it is answered; the daemon itself gives up after five seconds."""
+"""Time limit of a goal's reply [s]: it is planned first; the daemon gives up after five seconds."""
 RESET_TIMEOUT_S = 12.0
-"""Drives are connected and configured again; the daemon itself gives up after ten seconds."""
+"""Time limit of a reset [s]: drives are connected and configured again; the daemon gives up after ten seconds."""
 
 
 class Client(Connection):
     """Goal client of one cell: goals, commands, calibration, and messages of its daemon.
 
-    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
-    host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
-    ``while_waiting``: called again and again while an event is waited for; what it raises ends the wait.
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this host.
+    ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+    ``while_waiting``: called repeatedly during waits for an event; an exception that it raises ends the wait.
 
     Raises NotRunningError, SessionError.
     """
@@ -84,7 +84,7 @@ class Client(Connection):
         return self.fetch(self.keys.info, CellInfo)
 
     def running_goals(self) -> tuple[RunningGoal, ...]:
-        """Goals of all operators that were accepted and have not ended, with set-points and plans, the oldest first."""
+        """Accepted goals of all operators that have not ended, with set-points and plans, the oldest first."""
         return self.fetch(self.keys.goals, RunningGoals).goals
 
     def schema(self, name: str) -> bytes:
@@ -92,17 +92,15 @@ class Client(Connection):
         return self.query(self.keys.schema(name))
 
     def stop(self, operator: str | None = None) -> Reply:
-        """Stop the arm, in the name of ``operator`` (default: this client's).
+        """Stop the arm on behalf of ``operator`` (default: this client's operator).
 
-        Raises RefusedError where the servo process did not acknowledge it, NoReplyError.
+        Raises RefusedError if the servo process did not acknowledge the stop, NoReplyError.
         """
         stop = Stop(self.operator if operator is None else operator)
         return self.request("stop", self.keys.stop, encode(stop))
 
     def joints(self) -> dict[str, float]:
-        """Positions of the joints by name [rad or m]. Raises ClientError where they are unknown: the drives tell
-        none.
-        """
+        """Positions of the joints by name [rad or m]. Raises ClientError if the drives do not report them."""
         state = self.status()
         if not state.joints:
             age = "" if state.joints_age_s is None else f"; the last ones are {state.joints_age_s:.1f} s old"
@@ -113,7 +111,7 @@ class Client(Connection):
         return state.joints
 
     def enable(self, timeout_s: float = 10.0) -> None:
-        """Let the arm move; returns once it is ACTIVE. Raises RefusedError, TimedOutError."""
+        """Enable motion of the arm; returns once it is ACTIVE. Raises RefusedError, TimedOutError."""
         self.command("enable", Enable())
         self.wait_state(lambda state: state.lifecycle in ("active", "fault"), "active", timeout_s)
         if self.status().lifecycle == "fault":
@@ -151,11 +149,12 @@ class Client(Connection):
         raise TimedOutError(f"the cell is {self.status().lifecycle} {timeout_s:g} s after the reset")
 
     def jog(self, velocities: Mapping[str, float], lease_s: float = 0.25) -> Reply:
-        """Jog: joint velocities for ``lease_s``; call again within it to continue (a dead man's switch)."""
+        """Jog: joint velocities for ``lease_s``; call again within this time to continue (dead man's switch)."""
         return self.command("jog", Jog(dict(velocities), lease_s))
 
     def auxiliary(self, values: Mapping[str, float]) -> Reply:
-        """Order auxiliary joints [rad or m] and digital outputs (0 or 1) by name; the state tells when they are there.
+        """Command auxiliary joints [rad or m] and digital outputs (0 or 1) by name; the state reports when they are
+        reached.
 
         Raises RefusedError.
         """
@@ -164,13 +163,13 @@ class Client(Connection):
     def record(self, on: bool = True, images: bool = False) -> Reply:
         """Start or stop a flight recording; the reply's message is its file on the daemon's host.
 
-        ``images``: with what the cameras deliver, in ``NAME.images`` beside it; its end is reported by the event
-        ``images_recorded``. Raises RefusedError.
+        ``images``: also record the camera images, in ``NAME.images`` next to it; the event ``images_recorded`` reports
+        their end. Raises RefusedError.
         """
         return self.request("record", self.keys.command("record", self.operator), encode(Record(on, images)))
 
     def wait_state(self, wanted: Callable[[StateMessage], bool], what: str, timeout_s: float) -> StateMessage:
-        """Poll the state until it is as ``wanted``. Raises TimedOutError."""
+        """Poll the state until ``wanted`` returns True; ``what`` names it in the error. Raises TimedOutError."""
         until = time.monotonic() + timeout_s
         while True:
             state = self.status()
@@ -189,16 +188,16 @@ class Client(Connection):
     ) -> GoalHandle:
         """Send a goal: a target, the name of a taught goal, joint positions by name, or set-points by camera.
 
-        ``lease_s`` is 5 unless given. The lease is renewed by a thread of this client until the goal has ended or the
-        client is closed: a client that dies stops the arm. ``lease_s=None``: the goal continues without the client.
-        Raises RefusedError with every problem, NoReplyError, MessageError.
+        ``lease_s``: 5 by default. A thread of this client renews the lease until the goal has ended or the client is
+        closed: if the client dies, the arm stops. ``lease_s=None``: the goal continues without the client. Raises
+        RefusedError with all problems, NoReplyError, MessageError.
         """
         options.setdefault("lease_s", 5.0)
         return self.send(self.make_goal(target, **options))
 
     @staticmethod
     def make_goal(target: Target | str | Mapping[str, Any], **options: Unpack[GoalOptions]) -> Goal:
-        """A goal with an id of its own; for :meth:`check` and :meth:`send`. Raises MessageError for bad fields."""
+        """A goal with a new id, for :meth:`check` and :meth:`send`. Raises MessageError for bad fields."""
         return decode(encode({"id": str(uuid.uuid4()), "target": as_target(target), **options}), Goal)
 
     def check(self, goal: Goal) -> Reply:
@@ -209,7 +208,7 @@ class Client(Connection):
         return self.request("goal", self.goal_key, encode(msgspec.structs.replace(goal, check=True)), GOAL_TIMEOUT_S)
 
     def send(self, goal: Goal) -> GoalHandle:
-        """Send a goal made by the caller; returns once it was planned and accepted."""
+        """Send a goal created by the caller; returns once it is planned and accepted."""
         watch = EventWatch(self)
         try:
             reply = self.request("goal", self.goal_key, encode(goal), GOAL_TIMEOUT_S)
@@ -252,7 +251,7 @@ class Client(Connection):
         return self.request("synthesise", self.keys.command("synthesise", self.operator), encode(wanted))
 
     def undo_refinement(self) -> Reply:
-        """Bring the calibrated model back that the one in use was refined from on-line. Raises RefusedError."""
+        """Restore the calibrated model from which the model in use was refined on-line. Raises RefusedError."""
         return self.request("undo refinement", self.keys.command("restore", self.operator), encode(Restore()))
 
     def calibrate(
@@ -263,10 +262,11 @@ class Client(Connection):
         report: bool = False,
         lease_s: float | None = 5.0,
     ) -> CalibrationResult:
-        """Calibrate the cell. ``progress`` is called with every event of it. ``report``: wait for the report, too.
+        """Calibrate the cell. ``progress`` is called with each event of the calibration. ``report``: wait for the
+        report, too.
 
-        The motion has a lease that this client renews (``lease_s=None``: none): a client that dies stops it.
-        Raises RefusedError, FailedError (``code``: of the fit that failed, or of the reason that ended the motion).
+        The motion has a lease that this client renews (``lease_s=None``: none): if the client dies, the motion stops.
+        Raises RefusedError, FailedError (``code``: of the failed fit, or of the reason that ended the motion).
         """
         return calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
 
@@ -277,7 +277,7 @@ class Client(Connection):
         *,
         lease_s: float | None = 5.0,
     ) -> CheckReport:
-        """Run a short check motion and test whether the model in use still holds. Raises RefusedError, FailedError."""
+        """Run a short check motion and test whether the model is still valid. Raises RefusedError, FailedError."""
         return check_model(self, progress, timeout_s, lease_s)
 
     def reset_zeros(
@@ -287,10 +287,9 @@ class Client(Connection):
         *,
         lease_s: float | None = 5.0,
     ) -> ZeroReset:
-        """Run a check motion; where joint zeros have drifted, and nothing else has, install a model with corrected
-        zeros.
+        """Run a check motion; if only joint zeros have drifted, install a model with corrected zeros.
 
-        ``progress`` is called with the ``checked`` event, too. Raises RefusedError, FailedError (its event's ``name``:
+        ``progress`` is also called with the ``checked`` event. Raises RefusedError, FailedError (its event's ``name``:
         ``check_holds``, ``other_cause``, ``not_observable`` or the code of a check that failed).
         """
         return reset_zeros(self, progress, timeout_s, lease_s)
@@ -300,11 +299,11 @@ class Client(Connection):
     def watch(
         self, *, features: bool = False, every_s: float = 0.0
     ) -> Iterator[StateMessage | EventMessage | FeaturesMessage]:
-        """Iterate over all messages of the cell, without end; raises DaemonLostError when the daemon goes away,
+        """Iterate over all messages of the cell, without end; raises DaemonLostError if the daemon disappears,
         InvalidReplyError.
 
-        With ``every_s`` [s] it looks only so often, and gives of each camera the newest markers alone: what is watched
-        by eye takes little of a processor then.
+        With ``every_s`` [s], messages are polled at this interval, and only the newest markers of each camera are
+        returned: this saves processor time for displays.
         """
         kinds: list[tuple[str, type[Any], int]] = [
             (self.keys.event, EventMessage, 1024),
@@ -335,7 +334,7 @@ class Client(Connection):
 
 
 def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple[str, Any, type[Any]]]:
-    """Of messages (key, payload, kind), the oldest first: of markers the last of each key alone, and all others."""
+    """Messages (key, payload, kind), the oldest first; of the marker messages only the last of each key."""
     last = {key: k for k, (key, _, _) in enumerate(arrived)}
     return [
         (key, payload, kind)
@@ -345,8 +344,8 @@ def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple
 
 
 # -- calibration requests ------------------------------------------------------------------------------------
-# Requests of a client to calibrate a cell, check its model or reset joint zeros: runs the motion under a lease and
-# waits for the result.
+# Requests of a client to calibrate a cell, check its model or reset joint zeros: run the motion under a lease and
+# wait for the result.
 
 
 REPORT_TIMEOUT_S = 120.0
@@ -416,7 +415,7 @@ def _run(
         finally:
             lease.end()
         if report and end.kind != "calibration_aborted":
-            with suppress(TimedOutError):  # the model exists; an event announces its report, if it comes
+            with suppress(TimedOutError):  # the model exists; an event announces its report, if there is one
                 heard.wait(("calibration_report",), "the report", REPORT_TIMEOUT_S)
     return end
 
@@ -426,7 +425,7 @@ def _run(
 
 
 class GoalOptions(TypedDict, total=False):
-    """Fields of `Goal` beside id and target; the cell's default applies to those left out."""
+    """Fields of `Goal` except id and target; the cell's defaults apply to omitted ones."""
 
     law: LawName | None
     points: PointSource | None

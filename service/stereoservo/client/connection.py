@@ -36,12 +36,14 @@ from stereoservo.messages.wire import (
 
 TLS_VARIABLE = "STEREOSERVO_TLS_DIR"
 READ_TRIES = 2
-"""So often state, events and the like are asked for: on a busy computer a reply may take longer than the time-out, or
-be lost with a connection that is being opened anew. Together less than a gateway that hangs is given to live."""
+"""Number of attempts to query state, events and other data: on a busy computer a reply may take longer than the
+time-out, or be lost with a connection that is being reopened. Together they take less time than the hang limit of the
+gateway.
+"""
 READ_PAUSE_S = 0.1
-"""Before it is asked again, where the question ended at once: nobody was there to answer."""
+"""Pause before the next attempt [s] if a query ended at once because nobody was there to answer."""
 NEXT_EVENT = 2**53
-"""Above every event's number: a query from it on returns no event, only the number of the next one."""
+"""Larger than every event number: a query from this number on returns no event, only the number of the next one."""
 
 _T = TypeVar("_T")
 
@@ -49,9 +51,9 @@ _T = TypeVar("_T")
 class Connection:
     """A zenoh session with the daemon of one cell.
 
-    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this
-    host. ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
-    ``while_waiting``: called again and again while an event is waited for; what it raises ends the wait.
+    ``cell``: name, or the path of a cell file. ``endpoint``: a zenoh endpoint; default: the daemon of this host.
+    ``tls``: directory with ``ca.pem``, ``cert.pem``, ``key.pem`` (default: ``$STEREOSERVO_TLS_DIR``).
+    ``while_waiting``: called repeatedly during waits for an event; an exception that it raises ends the wait.
 
     Raises NotRunningError, SessionError.
     """
@@ -101,7 +103,8 @@ class Connection:
         return reply
 
     def fetch(self, key: str, kind: type[_T]) -> _T:
-        """Query a message of type ``kind`` on ``key``; without a reply ``READ_TRIES`` times: reading changes nothing.
+        """Query a message of type ``kind`` on ``key``; repeated up to ``READ_TRIES`` times without a reply, because
+        reading has no side effects.
 
         Raises RefusedError, NoReplyError, InvalidReplyError.
         """
@@ -145,11 +148,11 @@ class Connection:
     def update(
         self, goal_id: str, target: StreamedTarget, stamp_s: float | None = None, *, answered: bool = False
     ) -> None:
-        """Move the set-points of the active goal, which also renews its lease. ``stamp_s``: their time on this
-        client's clock.
+        """Move the set-points of the active goal, which also renews its lease. ``stamp_s``: their time on this client's
+        clock.
 
-        A put, for streams of 30 to 200 Hz: what is refused is reported by ``goal_refused`` events, at most one a
-        second. ``answered``: a query instead; raises RefusedError.
+        A put, for streams of 30 to 200 Hz: refusals are reported by ``goal_refused`` events, at most one per second.
+        ``answered``: a query instead; raises RefusedError.
         """
         command = UpdateGoal(goal_id, target, stamp_s)
         if answered:
@@ -181,7 +184,7 @@ class Connection:
 
 
 def read_message(key: str, data: bytes, kind: type[_T]) -> _T:
-    """Decode a message received on ``key``. Raises InvalidReplyError where it is not a ``kind``."""
+    """Decode a message received on ``key``. Raises InvalidReplyError if it is not a ``kind``."""
     try:
         return read(data, kind)
     except MessageError as error:

@@ -1,4 +1,4 @@
-"""Exceptions that the goal client raises; each carries its data."""
+"""Exceptions of the goal client; each carries its data."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ class ClientError(Exception):
 
 
 class NoReplyError(ClientError):
-    """No reply: the daemon is gone, hangs, or does not authorise this client."""
+    """No reply: the daemon does not run, hangs, or does not authorise this client."""
 
     def __init__(self, key: str, timeout_s: float, tries: int = 1) -> None:
         within = f"within {timeout_s:g} s" if tries == 1 else f"in {tries} tries of {timeout_s:g} s"
@@ -23,7 +23,7 @@ class NoReplyError(ClientError):
 
 
 class InvalidReplyError(ClientError):
-    """A message on ``key`` does not decode: it is of another version or sender."""
+    """A message on ``key`` cannot be decoded: it is of another version or sender."""
 
     def __init__(self, key: str, error: MessageError) -> None:
         super().__init__(
@@ -53,16 +53,16 @@ class FailedError(ClientError):
 
     @property
     def code(self) -> str:
-        """Code of the cause: the event's ``name`` (a fit's code; that of a warning is a goal's), else that of its first
-        reason, else ``failed``.
+        """Code of the cause: the event's ``name`` (the code of a fit; in a warning the name of a goal), else the code
+        of its first reason, else ``failed``.
         """
         name = "" if self.event.kind == "warning" else self.event.name
         return name or next((reason.code for reason in self.event.reasons), "failed")
 
 
 class TimedOutError(ClientError):
-    """An event or state did not come in time."""
+    """An event or state did not arrive in time."""
 
 
 class DaemonLostError(ClientError):
-    """The daemon went away, or was replaced by another one, while this client waited."""
+    """The daemon ended, or was replaced by another one, while this client waited."""

@@ -19,7 +19,7 @@ ALIVE_EVERY_S = 1.0
 
 
 class EventWatch:
-    """Events from now on, in order and without gaps: those that a subscription lost are queried."""
+    """Events since construction, in order and without gaps: events that the subscription lost are queried."""
 
     def __init__(self, connection: Connection) -> None:
         self._connection = connection
@@ -29,7 +29,7 @@ class EventWatch:
         self._next = connection.events(NEXT_EVENT).next
         self._alive = time.monotonic()
         self._left: deque[EventMessage] = deque()
-        """Came with one that was waited for, after it."""
+        """Events that arrived in the same poll after an awaited one."""
 
     def poll(self) -> list[EventMessage]:
         """Events since the last poll. Raises DaemonLostError, InvalidReplyError."""
@@ -80,7 +80,7 @@ class EventWatch:
         self._alive = time.monotonic()
 
     def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:
-        """Wait for an event that comes from now on. Raises TimedOutError, DaemonLostError."""
+        """Wait for a later event for which ``wanted`` returns True. Raises TimedOutError, DaemonLostError."""
         until = time.monotonic() + timeout_s
         while True:
             self._left.extend(self.poll())
@@ -109,10 +109,10 @@ class EventWatch:
 
 
 class HeardEvents:
-    """Events of one matter, heard by a watch. A wait for one of them also finds it where it came before the wait: what
-    several processes tell comes in any order.
+    """Events of one subject, received by a watch. A wait also finds events that arrived before it, because events of
+    several processes arrive in any order.
 
-    ``concerns``: whether an event is of the matter; ``hear``: called with each of these, once, in order.
+    ``concerns``: whether an event belongs to the subject; ``hear``: called with each of these, once, in order.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class HeardEvents:
         self._first: dict[str, EventMessage] = {}
 
     def poll(self) -> None:
-        """Hear what has come. Raises DaemonLostError, InvalidReplyError."""
+        """Process the events that have arrived. Raises DaemonLostError, InvalidReplyError."""
         for event in self._watch.poll():
             self._take(event)
 
@@ -139,9 +139,7 @@ class HeardEvents:
         return True
 
     def wait(self, kinds: tuple[str, ...], what: str, timeout_s: float) -> EventMessage:
-        """The first event of one of ``kinds``, of those that were heard or else to come. Raises TimedOutError,
-        DaemonLostError.
-        """
+        """The first event of one of ``kinds``, received already or awaited. Raises TimedOutError, DaemonLostError."""
         heard = [self._first[kind] for kind in kinds if kind in self._first]
         if heard:
             return min(heard, key=lambda event: event.seq)

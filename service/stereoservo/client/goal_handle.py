@@ -40,13 +40,13 @@ class GoalResult(msgspec.Struct, frozen=True):
 
     @property
     def why(self) -> str:
-        """The message, with the fault where one ended the goal."""
+        """The message, with the fault if one ended the goal."""
         faults = [reason.hint for reason in self.reasons if reason.level == "fault"]
         return ": ".join([self.message, *faults])
 
 
 class GoalProgress(msgspec.Struct, frozen=True):
-    """Progress of a goal: path parameter ``progress`` [0, 1], ``seconds_left`` where known, ``reasons``.
+    """Progress of a goal: path parameter ``progress`` [0, 1], ``seconds_left`` if known, ``reasons``.
 
     ``active``: False while it is queued and once it has ended.
     """
@@ -59,7 +59,7 @@ class GoalProgress(msgspec.Struct, frozen=True):
 
 
 class Lease:
-    """Renews the lease of a motion from a thread, until it is ended."""
+    """Renews the lease of a motion from a thread, until :meth:`end`."""
 
     def __init__(self, connection: Connection, goal_id: str, lease_s: float | None) -> None:
         self._connection = connection
@@ -72,7 +72,7 @@ class Lease:
         while not self._ended.wait(every_s):
             try:
                 self._connection.renew(self._id)
-            except zenoh.ZError:  # the session is closed: the lease runs out, as it should
+            except zenoh.ZError:  # the session is closed: the lease expires, as intended
                 return
 
     def end(self) -> None:
@@ -81,7 +81,7 @@ class Lease:
 
 
 class GoalHandle:
-    """A goal that was accepted. As a context manager it cancels the goal when left before its end."""
+    """An accepted goal. As a context manager it cancels the goal on exit if it has not ended."""
 
     def __init__(self, connection: Connection, goal: Goal, watch: EventWatch, reply: Reply) -> None:
         self.id = goal.id
@@ -95,7 +95,8 @@ class GoalHandle:
         self._lease = Lease(connection, goal.id, goal.lease_s)
 
     def wait(self, timeout_s: float = 600.0, progress: Callable[[EventMessage], None] | None = None) -> GoalResult:
-        """Wait for its terminal event. ``progress`` is called with every event of it, as when the arm is held.
+        """Wait for its terminal event. ``progress`` is called with each of its events, for example when the arm is
+        held.
 
         Raises TimedOutError (the goal continues), DaemonLostError.
         """
@@ -121,7 +122,7 @@ class GoalHandle:
 
     @property
     def ended(self) -> bool:
-        """Whether its terminal event was seen, by :meth:`wait` or while streaming."""
+        """Whether its terminal event was received, by :meth:`wait` or while streaming."""
         return self._result is not None
 
     def progress(self) -> GoalProgress:
@@ -136,7 +137,7 @@ class GoalHandle:
         self._connection.update(self.id, target, stamp_s)
 
     def stream(self, set_points: Iterable[tuple[float | None, StreamedTarget]]) -> int:
-        """Send (stamp [s], target) as they come, until they, or the goal, end; returns how many were sent.
+        """Send pairs (stamp [s], target) until the iterable or the goal ends; returns the number sent.
 
         The iterable sets the pace. Raises DaemonLostError.
         """

@@ -28,8 +28,8 @@ class SessionError(ClientError):
 def base_config() -> dict[str, Any]:
     """Settings common to every session: no discovery, no shared memory, bounded queues and messages."""
     return {
-        # Discovery would announce the arm to every host of the network and bring in peers that no access rule
-        # sees.
+        # Discovery would announce the arm to every host of the network and connect peers that no access rule
+        # covers.
         "scouting": {"delay": 0, "multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
             "shared_memory": {"enabled": False},  # leaves segments behind and has watchdog drops
@@ -37,7 +37,7 @@ def base_config() -> dict[str, Any]:
             "link": {
                 "tx": {
                     "lease": 2000,
-                    # A subscriber that hangs must cost its messages, not this process's time.
+                    # A subscriber that hangs must lose its messages, and not delay this process.
                     "queue": {
                         "congestion_control": {
                             "drop": {"wait_before_drop": 0},
@@ -52,7 +52,7 @@ def base_config() -> dict[str, Any]:
 
 
 def client_mode(endpoints: list[str]) -> dict[str, Any]:
-    """Settings of a session that connects to a router at ``endpoints`` and listens nowhere."""
+    """Settings of a session that connects to a router at ``endpoints`` and does not listen."""
     return {
         "mode": "client",
         "listen": {"endpoints": []},
@@ -66,9 +66,10 @@ def client_mode(endpoints: list[str]) -> dict[str, Any]:
 
 
 def client_config(endpoint: str, tls: Path | None = None) -> dict[str, Any]:
-    """A client of the daemon at ``endpoint``; ``tls``: directory with ``ca.pem``, ``cert.pem`` and ``key.pem``.
+    """Settings of a client of the daemon at ``endpoint``; ``tls``: directory with ``ca.pem``, ``cert.pem`` and
+    ``key.pem``.
 
-    Raises SessionError for a file that is missing.
+    Raises SessionError for a missing file.
     """
     config = base_config()
     if tls is not None:
@@ -100,7 +101,7 @@ def open_session(config: dict[str, Any]) -> Any:
 
 
 def _certificate_hint(config: dict[str, Any], where: str) -> str:
-    """What to look at where a client's TLS connection failed: zenoh tells a refused certificate as a time limit."""
+    """Hint for a failed TLS connection of a client: zenoh reports a refused certificate as a time-out."""
     if config["mode"] != "client" or "tls/" not in where:
         return ""
     tls = config["transport"]["link"].get("tls", {})
@@ -114,9 +115,9 @@ def _certificate_hint(config: dict[str, Any], where: str) -> str:
 
 
 def close_session(session: Any, declared: list[Any]) -> bool:
-    """Undeclare, then close, in a side thread: a hung client would hold ``close`` for 10 s.
+    """Undeclare, then close, in another thread: a hung client would block ``close`` for 10 s.
 
-    Returns whether that was done within `CLOSE_TIMEOUT_S`; the process may end without it.
+    Returns whether this was completed within `CLOSE_TIMEOUT_S`; the process may end without it.
     """
 
     def work() -> None:

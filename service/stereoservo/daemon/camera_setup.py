@@ -1,5 +1,5 @@
-"""Constructs the camera drivers and detectors of a cell from its cell file, describes them to the other processes, and
-opens recorded cameras in their place.
+"""Constructs the camera drivers and detectors of a cell from its cell file, describes them for the other processes, and
+opens recorded cameras instead of them.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def describe_camera(
 ) -> CameraDescription:
     """The driver's description with the cell's name for the camera, the detector's marker ids and systematic error.
 
-    Raises CellFileError: a detector too many or too few, a camera that can report no marker.
+    Raises CellFileError for an unexpected or missing detector, or a camera that can report no marker.
     """
     description = msgspec.structs.replace(driver.describe(), name=section.name)
     if detector is not None:
@@ -71,7 +71,7 @@ def describe_camera(
 
 VIDEO = "video"
 END_CODES = ("end_of_file", "truncated")
-"""Codes of the driver's error when a recording has no more frames; the second where one of its files is cut off."""
+"""Codes of the driver's error when a recording has no more frames; the second if one of its files is truncated."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class RecordedCamera:
     ) -> Iterator[CameraObservation]:
         """Observations of the frames in order, detected without priors; stamps are those of the recording.
 
-        Only frames whose shutter time is ``wanted`` are detected; ``log`` is called where a file is cut off.
-        Raises DriverError: a damaged file, a picture of another size.
+        Markers are detected only in frames whose shutter time is ``wanted``; ``log`` is called if a file is truncated.
+        Raises DriverError for a damaged file or an image of another size.
         """
         try:
             self.driver.configure()
@@ -120,8 +120,8 @@ def video_of(directory: Path, camera: str) -> Path:
 def recorded_camera(cell: CellFile, cell_path: Path, name: str, file: Path, start: int = 0) -> RecordedCamera:
     """Driver and detector of camera ``name`` of a cell, for a file recorded from it, from frame ``start`` on.
 
-    The detector is the cell file's, the options of the camera's own driver have had their effect when it was recorded.
-    Raises ImageFileError, PluginError, DriverError, CellFileError.
+    The detector is that of the cell file; the options of the camera's driver are not used, because they took effect
+    during the recording. Raises ImageFileError, PluginError, DriverError, CellFileError.
     """
     section = next(camera for camera in cell.camera if camera.name == name)
     with ImageReader(file, name) as reader:
@@ -152,5 +152,5 @@ def recorded_camera(cell: CellFile, cell_path: Path, name: str, file: Path, star
     )
     driver, detector = make_camera(recorded, context)
     description = describe_camera(recorded, driver, detector, cell_path)
-    assert detector is not None  # describe_camera refuses a camera of frames without one
+    assert detector is not None  # describe_camera rejects a camera that delivers frames without one
     return RecordedCamera(file, description, driver, detector)

@@ -1,8 +1,8 @@
 """Preparation of a run in a process of its own: checks cell file and drivers, writes the run plan (the configuration
-that all processes read), compiles the numba kernels that a cell needs before all others: its detectors', and those of a
-core without a model.
+that all processes read), compiles the numba kernels that a cell needs first: those of its detectors and of a core
+without a model.
 
-It is a process of its own: a driver that crashes when it is asked for its description ends nothing else.
+In its own process, a driver that crashes while it describes itself ends nothing else.
 ``python -m stereoservo.daemon.cell_preparation CELL.toml RUNTIME_DIRECTORY STATE_DIRECTORY PARENT_PID JSON_OPTIONS``.
 """
 
@@ -47,7 +47,7 @@ class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @contextmanager
 def _named(cell_path: Path, section: str) -> Iterator[None]:
-    """A driver's error prefixed with the file and the section of its options."""
+    """Context manager that prefixes a driver's error with the file and the section of its options."""
     try:
         yield
     except DriverError as error:
@@ -59,7 +59,7 @@ def describe_cell(
 ) -> tuple[JointDriverDescription, tuple[CameraDescription, ...]]:
     """Descriptions of joint driver and cameras, each camera with its detector's marker ids.
 
-    Raises PluginError, DriverError, CellFileError (a camera that can show no marker, or lacks a detector).
+    Raises PluginError, DriverError, CellFileError (a camera that can report no marker, or lacks a detector).
     """
     common = {
         "clock": clock,
@@ -114,7 +114,7 @@ def make_plan(cell_path: Path, runtime: Path, state: Path, options: PlanOptions)
 
 
 def main() -> int:
-    """Entry of the process: one line on stderr where the cell cannot be run."""
+    """Entry of the process; writes one line to stderr if the cell cannot be run."""
     cell_path, runtime, state = (Path(argument) for argument in sys.argv[1:4])
     die_with_parent(int(sys.argv[4]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)

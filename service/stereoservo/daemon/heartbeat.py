@@ -1,8 +1,7 @@
-"""Heartbeats of the daemon's processes, each in a slot of its own, and the watch that finds a process that hangs.
+"""Heartbeats of the daemon's processes, each in its own slot, and the watchdog that detects a hanging process.
 
-A beat states how long the next one may take at most, so that a process announces what takes long by its nature: a
-camera that is opened, drives that are configured anew. No beat, no watch: a process is watched from its first beat on,
-which it gives once it is ready.
+Each beat states the time limit of the next one, so a process can announce slow operations, such as opening a camera or
+reconfiguring drives. A process is watched from its first beat on, which it writes once it is ready.
 """
 
 from __future__ import annotations
@@ -20,28 +19,37 @@ HEARTBEAT_BYTES = _RECORD.size
 BEAT_EVERY_NS = 20_000_000
 
 SILENT_S = 0.5
-"""A process beats each 20 ms; what is shorter than this may be a stall of the machine."""
+"""Shortest reported silence [s]: a process beats every 20 ms; a shorter silence may be a stall of the machine."""
 SERVO_HANG_S = 2.0
-"""Without its commands the drives stop by themselves within 0.5 s, and from a stall of a shared machine, of up to a
-second, the core recovers (LOOP_GAP): what stands for longer cannot be trusted any more."""
+"""Time limit of the servo process [s]. Without its commands the drives stop within 0.5 s, and the core recovers from
+stalls of a shared machine of up to a second (LOOP_GAP). After a longer stall the process cannot be trusted.
+"""
 DRIVER_CALL_S = 15.0
-"""Drives that are connected, configured and enabled anew: the gateway waits 10 s for it."""
+"""Time limit while drives are reconnected, configured and enabled [s]: the gateway waits 10 s for it."""
 PLANT_HANG_S = 2.0
-"""Without samples the core brakes and holds; from a stall of a shared machine it recovers."""
+"""Time limit of the plant [s]. Without samples the core brakes and holds; it recovers from a machine's stall."""
 GATEWAY_HANG_S = 5.0
-"""The arm is held after 0.5 s of its silence, so nothing hurries; its files are on disks that may be slow."""
+"""Time limit of the gateway [s]. It is not critical, because the arm is held after 0.5 s of silence; the gateway's
+disks may be slow.
+"""
 SUPERVISOR_HANG_S = 0.8
-"""Nobody ends a supervisor that hangs, for the arm would stop without need: the gateway tells it."""
+"""Time limit of the supervisor [s]. A hanging supervisor is not ended, because the arm would stop unnecessarily; the
+gateway reports it.
+"""
 REQUEST_S = 60.0
-"""A client's request may have kernels compiled, where no warm-up did."""
+"""Time limit of a client's request [s]: it may compile kernels that no warm-up has compiled."""
 VISION_HANG_S = 3.0
-"""The slowest detectors search a whole image for some tenths of a second; the law brakes on prediction meanwhile."""
+"""Time limit of a vision process [s]: the slowest detectors search a whole image for some tenths of a second; meanwhile
+the law brakes, using the prediction.
+"""
 CAMERA_OPENS_S = 300.0
-"""Libraries wait for a camera for up to a minute, several times over; the first image has a detector compiled."""
+"""Time limit while a camera is opened [s]: libraries wait for it for up to a minute, several times; the detector is
+compiled for the first image.
+"""
 
 
 class HeartbeatWriter:
-    """The heartbeat of one process. Raises SlotError where another one writes it."""
+    """Writer of the heartbeat of one process. Raises SlotError if another process writes it."""
 
     def __init__(self, path: Path) -> None:
         self._slot = SlotWriter(path, HEARTBEAT_BYTES, HEARTBEAT_LAYOUT)
@@ -49,8 +57,8 @@ class HeartbeatWriter:
         self._due_ns = 0
 
     def beat(self, limit_s: float) -> None:
-        """Say that all is well, and that the next beat comes within ``limit_s``. To be called often: what says nothing
-        new is not written.
+        """Report that the process is alive, and that the next beat follows within ``limit_s``. To be called often;
+        redundant beats are not written.
         """
         now_ns = time.monotonic_ns()
         if limit_s != self._limit_s or now_ns >= self._due_ns:
@@ -63,14 +71,14 @@ class HeartbeatWriter:
 
 
 class Beat(NamedTuple):
-    """A heartbeat: its time, and how long the next one may take."""
+    """A heartbeat: its time, and the time limit of the next one."""
 
     t_ns: int
     limit_s: float
 
     def silent_s(self, usual_s: float) -> float:
-        """For how long the process has been silent, 0 where that is nothing to speak of (``SILENT_S``) or less than
-        it has announced. ``usual_s``: its limit where it announces nothing.
+        """Time since this beat [s], 0 if it is shorter than ``SILENT_S`` or than the time that the process has
+        announced. ``usual_s``: its usual limit, without an announcement.
         """
         age_s = (time.monotonic_ns() - self.t_ns) * 1e-9
         return age_s if age_s > (self.limit_s if self.limit_s > usual_s else SILENT_S) else 0.0
@@ -93,7 +101,7 @@ class HeartbeatReader:
         return None if record is None else Beat(*_RECORD.unpack(record))
 
     def process_lives(self) -> bool:
-        """Whether the process that beats, or may hang, is there at all; False before its start."""
+        """Whether the process that writes the heartbeat exists (it may hang); False before its start."""
         return self._slot.writer_lives()
 
     def close(self) -> None:
@@ -102,9 +110,10 @@ class HeartbeatReader:
 
 
 class HangWatch:
-    """The watch over one process.
+    """Watchdog of one process.
 
-    Time counts from when the watch saw a beat, not from the beat: of what a watch did not see, it accuses nobody.
+    Time is measured from the moment at which the watchdog read a beat, not from the beat itself, so that delays of the
+    watchdog do not count as a hang.
     """
 
     def __init__(self, path: Path) -> None:
@@ -113,13 +122,13 @@ class HangWatch:
         self._since_s = 0.0
 
     def begin(self) -> None:
-        """A process starts: what is in the slot is its predecessor's."""
+        """Start watching a new process: the beat in the slot is of its predecessor and is discarded."""
         self._reader.newest()
         self._limit_s = None
 
     def look(self, now_s: float, *, late: bool = False) -> str:
-        """Words on how the process hangs, '' where it does not. ``late``: nobody looked in time, so that the
-        measurement begins anew.
+        """Description of how the process hangs, '' if it does not. ``late``: the watchdog itself was late, so the
+        measurement starts again.
         """
         beat = self._reader.poll()
         if beat is not None:

@@ -1,6 +1,6 @@
 """Messages between the processes of one cell: structs with msgpack codecs (run plan, requests, heartbeats, servo state,
-reports), and, what passes with every frame, bytes of fixed places; the capacities and layouts of their shared-memory
-slots.
+reports), and, for the messages of each frame, byte records of fixed layout; the capacities and layouts of their
+shared-memory slots.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OBSERVATION_CAPACITY = 1 << 16
 PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
 PIXEL_STEP = 2.0**-12
-"""Of detected pixels; it adds a noise of 0.00007 px."""
+"""Quantization step of detected pixels [px]; it adds a noise of 0.00007 px."""
 
 
 class RunPlan(msgspec.Struct, frozen=True):
@@ -75,14 +75,14 @@ class RunPlan(msgspec.Struct, frozen=True):
         )
 
     def settings(self) -> CoreSettings:
-        """The core's settings. Raises CellFileError where cell file and drivers contradict each other."""
+        """The core's settings. Raises CellFileError if cell file and drivers contradict each other."""
         cap = COMMISSIONING_SPEED if self.commissioning else 1.0
         return core_settings(self.cell, self.joints, self.cameras, speed_cap=cap, watch_following=not self.dry_run)
 
 
 class Received(msgspec.Struct, frozen=True, tag="received"):
-    """What a receiver has: a sender's messages up to ``number`` (see `Outbox`). The servo process sends no event over a
-    connection before the gateway has said this.
+    """Acknowledgement: the receiver has the sender's messages up to ``number`` (see `Outbox`). The servo process sends
+    no event over a connection before it has received this from the gateway.
     """
 
     number: int
@@ -109,7 +109,7 @@ ToServo = Received | Heartbeat | Ask | NewModel
 
 
 class ServoState(msgspec.Struct, frozen=True, eq=False):
-    """State of the servo process, published some tens of times a second."""
+    """State of the servo process, published some tens of times per second."""
 
     status: Status
     loop: LoopStatistics
@@ -118,20 +118,20 @@ class ServoState(msgspec.Struct, frozen=True, eq=False):
     gateway: bool
     records_dropped: int
     differences: tuple[str, ...]
-    """Reasons why the drives were sent something other than the core's command; empty where they were not."""
+    """Reasons why the commands sent to the drives differ from the core's command; empty if they do not."""
     notes: tuple[str, ...] = ()
-    """Records of other processes that could not be read and were left out, by source."""
+    """Records of other processes that could not be read and were skipped, by source."""
     auxiliary: dict[str, float] = {}
     joints_ns: int = 0
-    """Stamp of the newest joint sample; 0: there was none yet."""
+    """Stamp of the newest joint sample [ns]; 0: none yet."""
     frames_ns: dict[str, int] = {}
-    """Stamp of the shutter of each camera's newest frame, but of none of the future."""
+    """Shutter stamp of each camera's newest frame [ns]; stamps in the future are ignored."""
 
 
 def newest_stamps(inputs: StepInputs, joints_ns: int, frames_ns: dict[str, int]) -> tuple[int, dict[str, int]]:
-    """Stamps of the newest joint sample and of each camera's newest frame [ns], given those before this step.
+    """Stamps of the newest joint sample and of each camera's newest frame [ns], given the stamps before this step.
 
-    A stamp of the future tells no age.
+    Stamps in the future are ignored, because they give no age.
     """
     sample = inputs.joints
     if sample is not None and joints_ns < sample.t_ns <= inputs.now_ns:
@@ -143,8 +143,8 @@ def newest_stamps(inputs: StepInputs, joints_ns: int, frames_ns: dict[str, int])
 
 
 class Report(msgspec.Struct, frozen=True):
-    """A message of a vision process or the supervisor that the gateway passes on to clients: ``number`` (1 and up) of
-    ``stream``, which each process begins anew.
+    """A message of a vision process or the supervisor that the gateway passes on to clients: ``number`` (1 and up) in
+    ``stream``; each process starts a new stream.
     """
 
     origin: str
@@ -152,18 +152,18 @@ class Report(msgspec.Struct, frozen=True):
     message: str
     t_ns: int
     images: RecordedImages | None = None
-    """Of a recording of images that has ended."""
+    """Result of a recording of images that has ended."""
     stream: int = 0
     number: int = 0
 
 
 def rounded(observation: CameraObservation) -> CameraObservation:
-    """The observation with no more digits than a detector knows: a hundredth of a pixel's noise takes half of a
-    number's bits, and every one of them is recorded.
+    """The observation rounded to the significant digits: at a noise of a hundredth of a pixel, half of a number's bits
+    are noise, and all of them would be recorded.
 
-    Pixels in steps of ``PIXEL_STEP``. Variances upwards by a 32nd at most, correlations towards zero by a 16th at most,
-    so that a covariance stays one, and neither its variances nor its determinant are less. Along the long axis of a
-    slanted ellipse the variance may be less, by a 32nd at most.
+    Pixels are rounded to multiples of ``PIXEL_STEP``. Variances are increased by at most 1/32, correlations are reduced
+    by at most 1/16, so that the covariance remains valid, and neither its variances nor its determinant decrease. Along
+    the long axis of a slanted ellipse the variance may decrease, by at most 1/32.
     """
     covariances = observation.covariances.copy()
     variances = covariances[:, (0, 1), (0, 1)]
@@ -176,7 +176,7 @@ def rounded(observation: CameraObservation) -> CameraObservation:
 
 
 def encode_observation(observation: CameraObservation) -> bytes:
-    """An observation of right shapes (`core.cycle.check_observation`) as bytes of fixed places."""
+    """An observation of valid shapes (`core.cycle.check_observation`) as bytes of fixed layout."""
     name, o = observation.camera.encode(), observation
     head = _OBSERVATION.pack(len(name), len(o.ids), o.seq, o.t_shutter_ns, o.t_received_ns)
     return head + _padded(name) + _places(o.ids, o.pixels, o.covariances)
@@ -197,7 +197,7 @@ def decode_observation(data: bytes) -> CameraObservation:
 
 
 def encode_prior(prior: Prior) -> bytes:
-    """A prior as bytes of fixed places."""
+    """A prior as bytes of fixed layout."""
     name = prior.camera.encode()
     head = _PRIOR.pack(len(name), len(prior.ids), prior.t_ns)
     return head + _padded(name) + _places(prior.ids, prior.pixels, prior.velocities, prior.covariances)
@@ -223,7 +223,7 @@ def _places(ids: IntArray, *numbers: FloatArray) -> bytes:
 
 
 def _apart(data: bytes, head: struct.Struct, words: int) -> tuple[str, int, tuple[int, ...], bytearray]:
-    """Camera, number of markers, numbers of the head, and ``words`` of 8 bytes a marker."""
+    """Camera, number of markers, numbers of the head, and ``words`` words of 8 bytes per marker."""
     if len(data) < head.size:
         raise ValueError(f"{len(data)} bytes; the head alone has {head.size}")
     length, k, *stamps = head.unpack_from(data)
@@ -238,7 +238,7 @@ def _padded(data: bytes) -> bytes:
 
 
 def pack_step_message(message: StepMessage) -> bytes:
-    """A message for the ring of step records; a step as it is, all else in msgpack."""
+    """A message for the ring of step records; a step unchanged, all others in msgpack."""
     if isinstance(message, RecordedStep):
         return _STEP.pack(_STEP_MARK, min(message.lost, 0xFFFFFFFF), message.t_ns) + message.data
     return encode(message)
@@ -262,11 +262,13 @@ event_decoder = msgspec.msgpack.Decoder(Event, dec_hook=decode_array)
 state_decoder = msgspec.msgpack.Decoder(ServoState, dec_hook=decode_array)
 _steps_decoder = msgspec.msgpack.Decoder(StepMessage, dec_hook=decode_array)
 _OBSERVATION, _PRIOR = struct.Struct("<IIqqq"), struct.Struct("<IIq")
-"""Bytes of the camera's name, markers; sequence number and stamps. Name, ids, pixels and what else there is follow,
-each from a multiple of 8 bytes on.
+"""Lengths of the camera's name and of the markers; sequence number and stamps. Name, ids, pixels and the other arrays
+follow, each aligned to 8 bytes.
 """
 _STEP = struct.Struct("<IIq")
-"""Before a step in the ring: mark, steps lost before it, time. What is rare is msgpack, which no mark begins."""
+"""Head of a step in the ring: mark, steps lost before it, time. Other messages are msgpack, which never begins with
+it.
+"""
 _STEP_MARK = 0xC1C1C1C1  # a byte that msgpack never uses
 received_decoder = msgspec.msgpack.Decoder(Received)
 report_decoder = msgspec.msgpack.Decoder(Report)
@@ -279,7 +281,7 @@ def save_plan(plan: RunPlan) -> None:
 
 
 def load_plan(runtime: Path) -> RunPlan:
-    """Read the plan of the cell whose runtime directory this is. Raises PlanError."""
+    """Read the plan of a cell from its runtime directory. Raises PlanError."""
     path = plan_path(runtime)
     with decoding(lambda cause: PlanError(path, f"{cause}; this process is started by `stereoservo run`")):
         return _plan_decoder.decode(read_bounded(path, MAX_PLAN_BYTES))

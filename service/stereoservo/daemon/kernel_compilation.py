@@ -1,12 +1,12 @@
-"""The numba kernels of a servo process (core, laws, planner, monitors): which are compiled first, which by a process
-beside the others, and how a servo process gets those into a loop that runs.
+"""Compilation of the numba kernels of a servo process (core, laws, planner, monitors): those that are compiled first,
+those compiled by a separate process, and how a servo process loads the latter while its loop runs.
 
 Kernels are compiled by running an example cell: an arm with two cameras runs some steps of each law; kernels are
-compiled by types, not by sizes. The cameras' lenses bend, so that the lens's kernels run too. A file in the cache of
-numba tells that all are compiled, of which sources, and with which signatures; the distribution
-``stereoservo-kernels`` (``deploy/kernels``) brings another one.
-``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside RUNTIME_DIRECTORY]`` compiles what is not compiled
-yet; ``beside`` others that work: niced, and telling how far it is.
+specialised for types, not for sizes. The cameras have lens distortion, so that the lens kernels run, too. A file in
+numba's cache records that all are compiled, from which sources, and with which signatures; the distribution
+``stereoservo-kernels`` (``deploy/kernels``) contains another one.
+``python -m stereoservo.daemon.kernel_compilation PARENT_PID [beside RUNTIME_DIRECTORY]`` compiles the missing kernels;
+with ``beside`` while other processes work: niced, and reporting its progress.
 """
 
 from __future__ import annotations
@@ -90,23 +90,23 @@ WIDTH, HEIGHT, FOCAL = 640, 480, 600.0
 JOINTS = tuple(f"j{k}" for k in range(1, 7))
 CAMERAS = ("left", "right")
 MARKERS = tuple(range(6))
-STEPS = 40  # a short plan is executed in a third of them
+STEPS = 40  # a third of them execute a short plan
 PERIOD_NS = 4_000_000
 MODULE, RECORD, BESIDE, ALONE = "stereoservo.daemon.kernel_compilation", "record", "beside", "alone"
 """This module, and its second arguments: for the second part of its work, and for low priority."""
 NICE = 10
-"""Of the process that compiles while cameras and arm work."""
+"""Niceness of the process that compiles while cameras and arm work."""
 KERNELS_IN_ALL = 300
-"""About so many signatures the whole warm-up holds: for telling how far it is, and nothing else."""
+"""Approximate number of signatures of the whole warm-up: only for progress reports."""
 WAIT_S = 0.2
-"""Between two looks whether another process has compiled."""
+"""Interval of the checks whether another process has compiled [s]."""
 LENS = np.array([-0.02, 0.5 * WIDTH, 0.5 * HEIGHT, 0.5 * WIDTH])
 
 
 def warm_up_first() -> None:
-    """Compile, or load, what a core needs that has no model: it jogs, moves joints, and makes trial motions.
+    """Compile, or load, the kernels of a core without a model, for jogging, joint moves and trial motions.
 
-    Laws of other distributions run as well, lest their kernels be compiled in the loop.
+    Laws of other distributions run as well, so that their kernels are not compiled in the loop.
     """
     model = example_model()
     pixels = _example_pixels(model)
@@ -118,15 +118,15 @@ def warm_up_first() -> None:
         core.step(
             msgspec.structs.replace(inputs, model_update=None, requests=(request,), driver_active=True, compiling=True)
         )
-    rows_of(*(np.zeros(0, np.int64),) * 3)  # at the stops of trials, with the joints there
+    rows_of(*(np.zeros(0, np.int64),) * 3)  # used at the stops of trials
     joints_at(core.state.history, 0)
     warm_up_laws(own=False)
 
 
 def warm_up() -> None:
-    """Run each law, the planner and fault isolation on the example cell, which compiles their kernels, or loads them.
+    """Run each law, the planner and fault isolation on the example cell, which compiles or loads their kernels.
 
-    What a goal in the images needs comes first, what is rarely asked for last.
+    Kernels for goals in the images come first, rarely used ones last.
     """
     warm_up_laws()
     warm_up_planner()
@@ -143,7 +143,7 @@ def warm_up() -> None:
 
 
 def _warm_up_goals() -> None:
-    """A core accepts, plans and runs a goal by each law."""
+    """Run a core that accepts, plans and executes a goal by each law."""
     model = example_model()
     pixels = _example_pixels(model)
     seven = np.ones(7)  # a redundant arm's self-motion
@@ -153,11 +153,11 @@ def _warm_up_goals() -> None:
     )  # a body of many markers, of which some are taken
     spread_in_images(few, pixels, seen)
     spread_in_images(few, pixels, seen, 3)
-    distort_pixel(LENS, 1.0, 1.0)  # for set-points that are said anew in a moved camera
+    distort_pixel(LENS, 1.0, 1.0)  # for set-points that are recomputed for a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     adaptive_gain(1.0, 2.0, 1.0, 1.0)
-    joint_step(np.ones((8, 7)), np.ones(8), np.ones(8), 1.0)  # of joints that may stand beside their readings
-    camera_chi2(np.zeros((1, 2)), np.eye(2)[None], np.ones(1), 1.0)  # of frames that may be late
+    joint_step(np.ones((8, 7)), np.ones(8), np.ones(8), 1.0)  # for joints that may differ from their readings
+    camera_chi2(np.zeros((1, 2)), np.eye(2)[None], np.ones(1), 1.0)  # for frames that may be late
     runs: list[tuple[str, PointSource]] = [(DEFAULT_LAW, "triangulated")]
     runs.extend((law, "predicted") for law in LAWS)
     for law, points in runs:
@@ -187,7 +187,7 @@ def _warm_up_goals() -> None:
 
 
 def _warm_up_agreement() -> None:
-    """A goal is reached, with a model that states its accuracy: whether the cameras agree is asked at no other time."""
+    """Run a core that reaches a goal with a model of stated accuracy: only then is the cameras' agreement checked."""
     plain, settings = example_model(), example_settings()
     pixels = _example_pixels(plain)
     matrices, lenses = [c.matrix for c in plain.cameras], [np.ones_like(c.lens) for c in plain.cameras]
@@ -216,8 +216,8 @@ OTHERS = tuple(range(20, 26))
 
 
 def _warm_up_following(mount: Mount) -> None:
-    """A core follows a target, the body before cameras on the arm or another one before cameras that stand: it is
-    found, moves on, jumps, and is brought in from where a goal was shown; then incidences go with it.
+    """Run a core that follows a target: the body for cameras on the arm, another body for static cameras. The target is
+    found, moves, jumps, and is transferred from the pose at which a goal was taught; then incidences follow it.
     """
     model, settings = msgspec.structs.replace(example_model(), mount=mount), example_settings()
     cameras = tuple(msgspec.structs.replace(c, mount=mount, mobile=False) for c in settings.cameras)
@@ -258,7 +258,7 @@ def _by_marker(ids: tuple[int, ...], pixels: FloatArray) -> dict[int, tuple[floa
 
 
 def _warm_up_fault_isolation(model: CellModel, pixels: FloatArray) -> None:
-    """Run the core on frames of a camera that was moved: fault isolation runs at no other time."""
+    """Run the core on frames of a moved camera: only then does fault isolation run."""
     settings = example_settings()
     static_cameras = tuple(msgspec.structs.replace(camera, mobile=False) for camera in settings.cameras)
     core = ServoCore(msgspec.structs.replace(settings, cameras=static_cameras))
@@ -382,7 +382,9 @@ class _Compiled(NamedTuple):
 
 
 class ShippedRecord(NamedTuple):
-    """Content of ``compiled.pickle`` of the installed kernels: what made them, the hashes of the sources of modules."""
+    """Content of ``compiled.pickle`` of the installed kernels: compiler versions, source hashes by module,
+    signatures.
+    """
 
     made_by: tuple[str, ...]
     sources: dict[str, str]
@@ -390,11 +392,11 @@ class ShippedRecord(NamedTuple):
 
     @staticmethod
     def maker() -> tuple[str, ...]:
-        """Of kernels that this process can load."""
+        """The ``made_by`` of kernels that this process can load."""
         return sys.implementation.cache_tag or "", platform.machine(), numba.__version__, llvmlite.__version__
 
     def misfit(self) -> str:
-        """Why these kernels do not fit, in words; '' where they do."""
+        """Reason why these kernels cannot be used, as text; '' if they can."""
         if self.made_by != self.maker():
             return f"made by {' '.join(self.made_by)}, here are {' '.join(self.maker())}"
         for module, known in self.sources.items():
@@ -405,13 +407,13 @@ class ShippedRecord(NamedTuple):
 
 
 def _shipped() -> ShippedRecord | None:
-    """The record of the installed kernels; None where none are, or another version wrote it."""
+    """The record of the installed kernels; None if there are none, or if another version wrote it."""
     folder = shipped_folder()
     if folder is None:
         return None
     try:
         return ShippedRecord(*pickle.loads((folder / "compiled.pickle").read_bytes()))
-    except Exception:  # whatever unpickling raises
+    except Exception:  # unpickling may raise anything
         return None
 
 
@@ -428,7 +430,7 @@ def _machine() -> tuple[str, ...]:
 
 
 def _stamp(file: str | Path) -> tuple[int, int]:
-    """Modification time [ns] and size, as numba tells whether a file has changed; zeros where it is not there."""
+    """Modification time [ns] and size, by which numba detects that a file has changed; zeros if it does not exist."""
     try:
         status = os.stat(file)
     except OSError:
@@ -446,8 +448,8 @@ def _lock_path() -> Path:
 
 
 def compiled() -> tuple[Overload, ...] | None:
-    """The signatures of all kernels, where all are in the cache or installed, of these sources and for this computer;
-    else None.
+    """The signatures of all kernels, if all are cached or installed for the current sources and this computer; else
+    None.
     """
     found = _cached_overloads()
     if found is None:
@@ -458,8 +460,8 @@ def compiled() -> tuple[Overload, ...] | None:
 
 def _cached_overloads() -> tuple[Overload, ...] | None:
     try:
-        record = _Compiled(*pickle.loads(_record_path().read_bytes()))  # in numba's cache, which is read likewise
-    except Exception:  # not there, or damaged: whatever unpickling raises
+        record = _Compiled(*pickle.loads(_record_path().read_bytes()))  # in numba's cache, which is unpickled, too
+    except Exception:  # missing or damaged: unpickling may raise anything
         return None
     if record.machine != _machine():
         return None
@@ -471,10 +473,10 @@ def _cached_overloads() -> tuple[Overload, ...] | None:
 
 
 def record_compiled() -> None:
-    """Load all kernels out of the cache, and record there which a servo process loads.
+    """Load all kernels from the cache, and record there which of them a servo process loads.
 
-    To be called in a process that has compiled none: one that has holds those, too, that only other kernels call. Laws
-    of other distributions are not recorded: every servo process runs them before its loop.
+    Must be called in a process that has compiled none, because a compiling process also holds kernels that only other
+    kernels call. Laws of other distributions are not recorded: every servo process runs them before its loop.
     """
     warm_up()
     found = tuple(overload for overload in overloads() if overload.module.startswith("stereoservo."))
@@ -491,13 +493,13 @@ def record_compiled() -> None:
 
 
 class KernelLoader:
-    """Gets kernels that another process compiles into a loop that runs: one at a time, for `advance` is called only
-    where nothing moves and a cycle may come late.
+    """Loads kernels that another process compiles while the loop runs: one at a time, because `advance` is called only
+    while nothing moves and a cycle may be late.
     """
 
     LOOK_NS = 500_000_000
     PAUSE_NS = 20_000_000
-    """Between two kernels: the drives are sent commands meanwhile."""
+    """Pause between two kernels [ns], in which commands are sent to the drives."""
 
     def __init__(self) -> None:
         self.loaded = False
@@ -507,7 +509,7 @@ class KernelLoader:
         self._known = _stamp(self._record)
 
     def advance(self, now_ns: int) -> None:
-        """Load the next kernel, once all are compiled and it is time."""
+        """Load the next kernel, if all are compiled and the pause is over."""
         if self.loaded or now_ns < self._due_ns:
             return
         if self._loading is None:
@@ -521,12 +523,12 @@ class KernelLoader:
         self._due_ns = now_ns + self.PAUSE_NS
         if next(self._loading, self) is self:
             self.loaded = True
-            gc.freeze()  # what numba has made is not looked through again: that would hold up the loop
+            gc.freeze()  # numba's objects are not scanned again by the collector: that would delay the loop
 
 
 def kernels_to_come() -> KernelLoader | None:
-    """The loader of what is not compiled yet; None where all is, and where no cache can be written: then a process
-    compiles for itself.
+    """The loader of the missing kernels; None if all are compiled, or if no cache is writable: then each process
+    compiles its own.
     """
     if not _has_cache():
         return None
@@ -535,7 +537,7 @@ def kernels_to_come() -> KernelLoader | None:
 
 
 def wait_until_compiled(given_up: Callable[[], bool]) -> None:
-    """Wait for the process that compiles into this cache, where there is one, or until ``given_up``."""
+    """Wait for the process that compiles into this cache, if there is one, or until ``given_up``."""
     lock = os.open(_lock_path(), os.O_RDWR | os.O_CREAT, 0o600)
     try:
         while not given_up():
@@ -548,19 +550,19 @@ def wait_until_compiled(given_up: Callable[[], bool]) -> None:
 
 
 def tell_progress(runtime: Path, part: str, daemon: int, total: int = 0) -> None:
-    """Have this process tell in a cell's runtime directory how many kernels it has compiled, of about ``total``."""
+    """Make this process report in a cell's runtime directory how many kernels it has compiled, of about ``total``."""
     path = progress_path(runtime, part)
 
     def tell(done: int) -> None:
-        with suppress(OSError):  # a full disk, or a directory that is gone, ends no compilation
+        with suppress(OSError):  # a full disk or a missing directory must not end the compilation
             path.write_bytes(msgspec.json.encode(CompilationProgress(part, daemon, done, total)))
 
     tell_compiled(tell)
 
 
 def collect_seldom() -> None:
-    """Make the garbage collector rare: what numba makes while it compiles stays, and looking through it costs a
-    twentieth of the time.
+    """Reduce the frequency of garbage collection: numba's objects persist, and scanning them takes a twentieth of the
+    compile time.
     """
     gc.freeze()
     gc.set_threshold(50_000, 20, 100)
@@ -588,9 +590,9 @@ def main() -> int:
 
 
 def _wait_for_others() -> None:
-    """Have one process at a time compile into this cache, until it ends."""
+    """Acquire the lock by which only one process at a time compiles into this cache; held until the process ends."""
     lock = os.open(_lock_path(), os.O_RDWR | os.O_CREAT, 0o600)
-    os.set_inheritable(lock, True)  # it is kept by what this process becomes
+    os.set_inheritable(lock, True)  # the lock is kept across exec
     fcntl.flock(lock, fcntl.LOCK_EX)
 
 
@@ -600,7 +602,7 @@ def _wait_for_others() -> None:
 
 
 def warm_up_laws(*, own: bool = True) -> None:
-    """Compile, or load from numba's cache, the kernels of all laws, limited rates included; without ``own`` only those
+    """Compile, or load from numba's cache, the kernels of all laws, including limited rates; without ``own`` only those
     of other distributions.
     """
     operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
@@ -621,7 +623,7 @@ def warm_up_laws(*, own: bool = True) -> None:
             continue
         try:
             law.step(scene, task, Options(1.0, 0.004, rotation_rate=1e-3, translation_rate=1e-3))
-        except Exception as error:  # a third party's law that cannot step: listed with its error, the others continue
+        except Exception as error:  # a third party's law that fails: listed with its error, the others continue
             LAWS.disable(name, f"its step raised {type(error).__name__}: {error}")
 
 
@@ -679,7 +681,7 @@ def warm_up_planner() -> None:
     beyond[0] = 0.7 * AWAY
     plan(_limited(request, position_max=beyond))
     gantry = request.operators.copy()
-    gantry[3:] = 0.0  # it cannot turn: the refusal says which freedom it lacks
+    gantry[3:] = 0.0  # it cannot rotate: the refusal names the missing degree of freedom
     plan(msgspec.structs.replace(request, operators=gantry))
     plan(msgspec.structs.replace(request, targets=request.points, centre_target=request.centre))
 

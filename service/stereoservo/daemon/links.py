@@ -1,8 +1,8 @@
 """Interfaces (protocols) of the servo loop and the vision loop: links to the other processes, messages from the
 gateway, and pacing of the cycles.
 
-The loops' code exists once. Between processes the links are slots and sockets (`servo_links`, `vision`) and time is the
-host's; in lockstep (`lockstep`) the links are objects in memory and time is virtual.
+The code of the loops is the same in all cases. Between processes the links are slots and sockets (`servo_links`,
+`vision`) and time is the host's; in lockstep (`lockstep`) the links are objects in memory and time is virtual.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class ServoLinks(Protocol):
         ...
 
     def observations(self) -> tuple[CameraObservation, ...]:
-        """The newest observation of each camera that was not returned before."""
+        """The newest observation of each camera, unless it was returned before."""
         ...
 
     def stop_raised(self) -> bool:
@@ -41,7 +41,7 @@ class ServoLinks(Protocol):
         ...
 
     def step_recorder(self) -> StepSink | None:
-        """The recorder that is connected; a new object for each connection."""
+        """The connected recorder; a new object for each connection."""
         ...
 
     def publish_prior(self, prior: Prior) -> None:
@@ -53,7 +53,7 @@ class ServoLinks(Protocol):
         ...
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
-        """Queue events, whose numbers ascend, and send those that wait; none is lost while the gateway restarts."""
+        """Queue events, whose numbers ascend, and send the queue; none is lost while the gateway restarts."""
         ...
 
 
@@ -70,7 +70,7 @@ class VisionLinks(Protocol):
 
 
 class Pacing(Protocol):
-    """Source of the servo loop's cycles: a clock's grid (`pacing.ClockPacing`), or an arm that sets the cycle."""
+    """Source of the servo loop's cycles: a fixed time grid (`pacing.ClockPacing`), or an arm that sets the cycle."""
 
     def wait(self) -> int:
         """Block until the next cycle is due; returns the time [ns] of waking."""

@@ -41,7 +41,7 @@ from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 REPLY_TIMEOUT_S = 60.0
-"""Of virtual time: a goal is planned before it is answered."""
+"""Virtual time limit of a reply [s]: a goal is planned before it is answered."""
 
 
 class LockstepTimeoutError(Exception):
@@ -65,11 +65,11 @@ class LockstepLinks(ServoLinks, Protocol):
         ...
 
     def send_request(self, request: Request) -> None:
-        """Send a request to the servo loop, in the gateway's place."""
+        """Send a request to the servo loop, as the gateway does."""
         ...
 
     def send_model(self, update: ModelUpdate) -> None:
-        """Send a model to the servo loop, in the gateway's place."""
+        """Send a model to the servo loop, as the gateway does."""
         ...
 
     def raise_stop(self) -> None:
@@ -77,7 +77,7 @@ class LockstepLinks(ServoLinks, Protocol):
         ...
 
     def take_events(self) -> list[Event]:
-        """Events since the last call, in the gateway's place."""
+        """Events since the last call, as the gateway receives them."""
         ...
 
     def close(self) -> None:
@@ -116,7 +116,7 @@ class MemoryLinks:
         self.run_cameras: Callable[[], None] = lambda: None
         self.gateway_alive = True
         self.state: ServoState | None = None
-        """The newest state that was published."""
+        """The newest published state."""
         self._recorder = None if recording is None else FlightFile(recording)
         self._requests: list[Request] = []
         self._model_update: ModelUpdate | None = None
@@ -133,7 +133,7 @@ class MemoryLinks:
         return messages
 
     def observations(self) -> tuple[CameraObservation, ...]:
-        """Run the vision loops; then the newest observation of each camera that was not returned before."""
+        """Run the vision loops; return the newest observation of each camera, unless it was returned before."""
         self.run_cameras()
         found = tuple(one.take() for one in self._cameras.values())
         return tuple(observation for observation in found if observation is not None)
@@ -144,11 +144,11 @@ class MemoryLinks:
         return raised
 
     def step_recorder(self) -> FlightFile | None:
-        """Writer of the recording, where one was requested."""
+        """Writer of the recording, if one was requested."""
         return self._recorder
 
     def publish_prior(self, prior: Prior) -> None:
-        """Hand a prior to its camera's vision loop."""
+        """Pass a prior to its camera's vision loop."""
         self._cameras[prior.camera].prior = prior
 
     def publish_state(self, state: ServoState) -> None:
@@ -228,7 +228,7 @@ class _ScheduledCamera:
         self._due_ns = self._clock.now_ns() + round(next(self._loop) * 1e9)
 
     def run(self) -> None:
-        """Run the vision loop, where it is due, until it waits; for the first time once the camera is open."""
+        """Run the vision loop, if it is due, until it waits; the first run follows the opening of the camera."""
         while self._due_ns <= self._clock.now_ns():
             self._resume()
 
@@ -240,8 +240,8 @@ class _ScheduledCamera:
 class LockstepCell:
     """A cell on a virtual clock. ``on_step`` is called with every step's inputs and outputs (logging, fault injection).
 
-    ``links``: in memory unless given; ``recording`` is for those. Raises CellFileError, PluginError, DriverError (the
-    arm or a camera that does not open).
+    ``links``: in memory by default; ``recording`` is only for these. Raises CellFileError, PluginError, DriverError
+    (the arm or a camera cannot be opened).
     """
 
     def __init__(
@@ -262,7 +262,7 @@ class LockstepCell:
         self.events: list[Event] = []
         self.status: Status | None = None
         self.reports: list[tuple[str, str]] = []
-        """Kind and message of what the vision loops have reported."""
+        """Kind and message of each report of the vision loops."""
         self.on_step = on_step
         self.on_event: list[Callable[[Event], None]] = []
         """Called with every event, after its step."""

@@ -1,7 +1,7 @@
 """Pacing of the servo loop by a clock: absolute deadlines on a fixed grid, timing statistics, real-time scheduling.
 
-Slot k is at ``start + k * period`` whatever happened before, so that an oversleep does not shift the later ones. A
-cycle that ran over its slot's end skips the slots that have passed instead of catching up with a burst.
+Slot k is always at ``start + k * period``, so a late wake-up does not shift later slots. After a cycle longer than its
+slot, the missed slots are skipped; there is no burst to catch up.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 
 from stereoservo.messages.servo_state import LoopStatistics
 
-_SUB_BITS = 4  # 16 bins an octave: quantiles good to 6 %
+_SUB_BITS = 4  # 16 bins per octave: quantiles accurate to 6 %
 _BINS = 48 << _SUB_BITS
 
 
@@ -39,7 +39,7 @@ class Histogram:
         self.maximum = max(self.maximum, value)
 
     def quantile(self, fraction: float) -> float:
-        """Value that ``fraction`` of the counted ones do not exceed (upper edge of its bin, at most the maximum)."""
+        """Value that ``fraction`` of the counted values do not exceed (upper edge of its bin, at most the maximum)."""
         if not self.count:
             return 0.0
         rank = fraction * self.count
@@ -126,14 +126,14 @@ class ClockPacing:
 
 
 CYCLE_LOG_VARIABLE = "STEREOSERVO_CYCLE_LOG"
-"""Names a file of zeros in which the loop notes its cycles: their number, then four 64-bit words each."""
+"""Environment variable: file of zeros in which the loop logs its cycles: their number, then four 64-bit words each."""
 _CYCLE = struct.Struct("=4q")
 CYCLE_BYTES = _CYCLE.size
 
 
 class LoggedPacing(ClockPacing):
-    """`ClockPacing` that notes every cycle in a mapped file: when it woke, how late [ns], the work of the cycle before
-    it [ns], the slots that this one skipped. What the file has no room for is not noted.
+    """`ClockPacing` that logs every cycle in a mapped file: time of waking, delay [ns], duration of the previous
+    cycle's work [ns], number of slots that this one skipped. Cycles beyond the end of the file are not logged.
     """
 
     def __init__(self, period_ns: int, path: Path) -> None:
@@ -143,7 +143,7 @@ class LoggedPacing(ClockPacing):
         self._room = len(self._log) // CYCLE_BYTES - 1
 
     def wait(self) -> int:
-        """Sleep until the next slot, and note it; returns the time of waking [ns]."""
+        """Sleep until the next slot, and log it; returns the time of waking [ns]."""
         work, skipped = self._now() - self._woke, self.skipped
         woke = super().wait()
         if self.cycles <= self._room:
@@ -154,20 +154,20 @@ class LoggedPacing(ClockPacing):
 
 
 def clock_pacing(period_ns: int) -> ClockPacing:
-    """The pacing of a loop; a `LoggedPacing` where ``STEREOSERVO_CYCLE_LOG`` names its file."""
+    """The pacing of a loop; a `LoggedPacing` if ``STEREOSERVO_CYCLE_LOG`` names its file."""
     log = os.environ.get(CYCLE_LOG_VARIABLE)
     return LoggedPacing(period_ns, Path(log)) if log else ClockPacing(period_ns)
 
 
 def prepare_realtime(priority: int) -> list[str]:
-    """Give back memory that loading left behind, freeze the garbage collector's generations and request SCHED_FIFO
-    (``priority`` 0: leave the scheduler as it is).
+    """Release memory that is unused after loading, freeze the garbage collector's generations and request SCHED_FIFO
+    (``priority`` 0: do not change the scheduler).
 
-    Returns warnings, each with its remedy; the loop runs without as well, and may wake late under load.
+    Returns warnings, each with its remedy; the loop also runs without real-time priority, but may wake late under load.
     """
     gc.collect()
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # glibc's; others keep no freed memory, or not so much
+    if trim is not None:  # glibc only; other libraries keep less freed memory
         trim(0)
     gc.freeze()
     if priority == 0:
@@ -190,14 +190,14 @@ def realtime_for_a_while(priority: int) -> Iterator[list[str]]:
     try:
         yield prepare_realtime(priority)
     finally:
-        # The flag may be set, and not be cleared, without privileges.
+        # Without privileges the flag can be set, but not cleared.
         os.sched_setscheduler(0, before | os.SCHED_RESET_ON_FORK, parameters)
         gc.unfreeze()
 
 
 @contextmanager
 def ordinary_for_a_while() -> Iterator[None]:
-    """Context manager: this thread without a real-time priority, for work that others must not wait for."""
+    """Context manager: this thread without real-time priority, for work that must not delay others."""
     before, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
     os.sched_setscheduler(0, os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.sched_param(0))
     try:

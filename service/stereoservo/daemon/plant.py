@@ -1,8 +1,8 @@
-"""The plant of a simulated cell: its drives and what they move, in a process of their own, at its own pace, as real
-drives stand outside the servo process.
+"""The plant of a simulated cell: its drives and mechanism, in a separate process with its own rate, as real drives are
+outside the servo process.
 
-`PlantProcess` serves any simulated joint driver, found by the cell's entry point, to a `plant_driver.PlantDriver`;
-`main` runs it as a process of its own. Without orders the drives stop by their own command time-out.
+`PlantProcess` runs any simulated joint driver, found by the cell's entry point, for a `plant_driver.PlantDriver`;
+`main` is the entry of the process. Without orders the drives stop by their own command time-out.
 ``python -m stereoservo.daemon.plant RUNTIME_DIRECTORY PARENT_PID``.
 """
 
@@ -37,20 +37,20 @@ from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, JointDriver
 
 MOVING_RATE_HZ = 1000.0
-"""At least, while the arm moves: so old may an order or a sample be."""
+"""Minimum rate while the arm moves: its period is the largest age of an order or a sample."""
 SETTLES_NS = 500_000_000
-"""For so long after the last motion the plant keeps this pace."""
+"""Time after the last motion for which the plant keeps this rate."""
 FAILED_READ_EVERY_NS = 100_000_000
 REPEAT_NS = 20_000_000
-"""At rest: how often the order to stay there is repeated to the drives, at least; four times in their time-out."""
+"""Largest interval at rest between repetitions of the order to the drives to stay: a quarter of their time-out."""
 EXIT_SETUP = 3
 
 
 class PlantProcess:
     """The drives of one cell behind two records: orders in, state out. Raises SlotError.
 
-    It obeys orders that are addressed to its ``session``; there are none before a `PlantDriver` has found it. ``beat``:
-    told before what may take longer, and in every step, within how many seconds it is told again.
+    It executes only orders that are addressed to its ``session``; there are none before a `PlantDriver` has found it.
+    ``beat``: called in every step, and before longer operations, with the time limit of its next call [s].
     """
 
     def __init__(
@@ -70,7 +70,7 @@ class PlantProcess:
         self.session = clock.now_ns()
         joints = len(self._description.joints)
         self._done = Orders(self.session, 0, False, 0, 0, 0, 0, np.zeros(joints), np.full(len(self._names), np.nan))
-        """The newest orders that were obeyed."""
+        """The newest executed orders."""
         self._values = np.zeros((4, joints))
         self._remarks = Remarks()
         self._state = PlantState(
@@ -84,7 +84,7 @@ class PlantProcess:
         self._slot = SlotWriter(directories.plant_state_slot, PLANT_CAPACITY, PLANT_STATE_LAYOUT)
 
     def step(self) -> None:
-        """Obey what was ordered since the last step, bring the drives up to now, and tell their state."""
+        """Execute the orders since the last step, advance the drives to the current time, and publish their state."""
         record = self._orders.poll()
         try:
             if record is not None:
@@ -100,11 +100,11 @@ class PlantProcess:
 
     @property
     def moves(self) -> bool:
-        """Whether the arm moves, or did a short while ago."""
+        """Whether the arm moves, or moved a short time ago."""
         return self._clock.now_ns() - self._moved_ns < SETTLES_NS
 
     def _repeats(self, orders: Orders) -> bool:
-        """Whether these orders are to stay at rest, as those before, and the drives were told so a moment ago."""
+        """Whether these orders only repeat the order to stay at rest, which was sent to the drives a moment ago."""
         done = self._done
         return (
             orders.velocity_number != done.velocity_number  # nothing else is new
@@ -115,7 +115,7 @@ class PlantProcess:
         )
 
     def _obey(self, orders: Orders) -> None:
-        """Do what is ordered and was not done yet: the stop first, then lifecycle calls, then motion. Raises
+        """Execute orders that were not executed yet: the stop first, then lifecycle calls, then motion. Raises
         DriverError.
         """
         done, self._done = self._done, orders
@@ -177,7 +177,7 @@ class PlantProcess:
         self._state = self._state._replace(remarks=msgspec.msgpack.encode(remarks))
 
     def _fail(self, error: DriverError) -> None:
-        """Stop the drives and tell what they raised; they are asked for a sample again after a pause."""
+        """Stop the drives and report their error; a sample is requested again after a pause."""
         self.driver.stop()
         self._remark(Remarks(error.code, str(error), error.retry, self._remarks.reasons, self._remarks.sent))
         self._state = self._state._replace(failures=self._state.failures + 1)
@@ -198,7 +198,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
     with closing(HeartbeatWriter(directories.heartbeat_slot("plant"))) as heartbeat:
         plant = PlantProcess(make_driver(plan, clock), directories, clock, beat=heartbeat.beat)
         with closing(plant):
-            # Real drives keep their time whatever the computer does; below the servo loop, which they must not delay.
+            # Real drives do not depend on the computer's load; priority below the servo loop, which must not wait.
             for warning in prepare_realtime(max(plan.cell.servo.priority - 1, 0)):
                 write_log("plant", warning)
             due_ns = clock.now_ns()

@@ -1,8 +1,8 @@
 """The joint driver of a simulated cell in the servo process: the drives themselves run in the process `plant`, as real
-ones stand outside this computer; and the records that pass between the two.
+drives are outside this computer; and the records that the two exchange.
 
-Both records are the newest only. `Orders` say what is wanted rather than what is to be done, so that none that is
-missed is missing later; a plant obeys those that are addressed to its own session, and comes up without power.
+Only the newest record is kept in each direction. `Orders` hold the wanted state and counters of requests, so a missed
+record loses nothing; a plant executes only orders that are addressed to its session, and starts without power.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ _ORDERS = struct.Struct("=7q")
 _STATE = struct.Struct("=6q??6x")
 
 ENDED = "plant_ended"
-"""Code of the error where the plant's process has ended."""
+"""Error code if the plant's process has ended."""
 APPEARS_S = 4.0
-"""For so long a call waits for a plant that is being started; it may be tried again."""
+"""Time for which a call waits for a plant that is being started [s]; the call may be repeated."""
 CALL_S = 10.0
-"""For so long a call waits for its answer."""
+"""Time for which a call waits for its answer [s]."""
 LOOK_S = 0.0005
 SILENT_NS = 20_000_000
-"""Without a sample for so long it is looked whether the plant's process lives."""
+"""Time without a sample after which the plant's process is checked [ns]."""
 
 
 class Orders(msgspec.Struct, eq=False):
-    """What the servo process wants of the drives of plant ``session``: numbers of the newest lifecycle ``call``, of the
-    ``stops``, of the velocity and of the auxiliary order ``asked``, and of ``auxiliary_stops``; ``active``: drives on.
+    """Orders of the servo process to the drives of plant ``session``: numbers of the newest lifecycle ``call``, of the
+    ``stops``, of the newest velocity and auxiliary orders, and of ``auxiliary_stops``; ``active``: drives on.
     ``velocities`` (n,); ``auxiliary`` (m,), NaN where nothing is ordered.
     """
 
@@ -76,15 +76,15 @@ class Orders(msgspec.Struct, eq=False):
 
     @classmethod
     def decoded(cls, record: bytes, joints: int) -> Self:
-        """From a record for so many joints."""
+        """From a record for a plant with ``joints`` joints."""
         session, call, active, stops, velocity, auxiliary, halts = _ORDERS.unpack_from(record)
         values = np.frombuffer(record, dtype=np.float64, offset=_ORDERS.size)
         return cls(session, call, bool(active), stops, velocity, auxiliary, halts, values[:joints], values[joints:])
 
 
 class Remarks(msgspec.Struct, frozen=True, array_like=True):
-    """Of a plant's state: its last failure, and why the last velocities were not sent as they were ordered, but as
-    ``sent``; empty: they were.
+    """Remarks of a plant's state: its last failure, and the reasons why the last velocities were sent as ``sent`` and
+    not as ordered; empty: they were sent as ordered.
     """
 
     code: str = ""
@@ -95,10 +95,10 @@ class Remarks(msgspec.Struct, frozen=True, array_like=True):
 
 
 class PlantState(NamedTuple):
-    """State of a plant's drives: its ``session``, the last ``call`` that it has answered, the number of ``failures``
-    so far, and the newest sample (``seq`` 0: there is none). ``numbers``, as bytes, taken apart where they are asked
-    for: of so many ``joints`` positions, velocities, efforts and following errors, of which the last two may not be
-    there; then auxiliary values, NaN where unknown. ``remarks``: `Remarks`, encoded.
+    """State of a plant's drives: its ``session``, the last answered ``call``, the number of ``failures`` so far, and
+    the newest sample (``seq`` 0: none). ``numbers``: bytes, decoded on demand: positions, velocities, efforts and
+    following errors of ``joints`` joints, of which the last two may be missing; then auxiliary values, NaN where
+    unknown. ``remarks``: `Remarks`, encoded.
     """
 
     session: int
@@ -118,13 +118,13 @@ class PlantState(NamedTuple):
 
     @classmethod
     def decoded(cls, record: bytes, auxiliaries: int) -> Self:
-        """From a record with so many auxiliary values."""
+        """From a record with ``auxiliaries`` auxiliary values."""
         head = _STATE.unpack_from(record)
         end = _STATE.size + 8 * (4 * head[5] + auxiliaries)
         return cls._make((*head, record[_STATE.size : end], record[end:]))
 
     def sample(self) -> JointState:
-        """The newest joint sample, in arrays of its own."""
+        """The newest joint sample, in new arrays."""
         values = np.frombuffer(bytearray(self.numbers), np.float64, 4 * self.joints)
         positions, velocities, efforts, following = values.reshape(4, -1)
         return JointState(
@@ -144,8 +144,9 @@ class PlantState(NamedTuple):
 class PlantDriver:
     """A joint driver whose drives are in the cell's plant process. Raises SlotError.
 
-    Velocities are in the plant's drives within its period; its command time-out is its own. Where its process ends,
-    calls raise ``plant_ended`` until :meth:`configure` finds its successor. ``sleep``: how calls wait [s].
+    Velocities reach the plant's drives within its period; the command time-out is the plant's. If its process ends,
+    calls raise ``plant_ended`` until :meth:`configure` finds its successor. ``sleep``: function by which calls wait
+    [s].
     """
 
     def __init__(
@@ -163,7 +164,7 @@ class PlantDriver:
         self._reader = SlotReader(directories.plant_state_slot, PLANT_STATE_LAYOUT)
         self._writer = SlotWriter(directories.plant_orders_slot, PLANT_CAPACITY, PLANT_ORDERS_LAYOUT)
         joints = len(description.joints)
-        first = clock.now_ns()  # so that no number is one that a servo process before this one has used
+        first = clock.now_ns()  # so that no number of a previous servo process is used again
         self._orders = Orders(0, first, False, first, 0, 0, first, np.zeros(joints), np.full(len(self._names), np.nan))
         self._zeros = np.zeros(joints)
         self._state: PlantState | None = None
@@ -172,13 +173,13 @@ class PlantDriver:
         self._encoded_remarks, self._remarks = b"", Remarks()
 
     def describe(self) -> JointDriverDescription:
-        """That of the plant's driver."""
+        """The description of the plant's driver."""
         return self._description
 
     # -- lifecycle ------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Have the plant set up its drives, without power; finds a plant that was started anew. Raises DriverError."""
+        """Make the plant set up its drives, without power; also finds a restarted plant. Raises DriverError."""
         until_ns = self._clock.now_ns() + round(APPEARS_S * 1e9)
         while True:
             state = self._look()
@@ -188,7 +189,7 @@ class PlantDriver:
                     self._call(active=False, session=state.session)
                     return
                 except DriverError as error:
-                    if error.code != ENDED:  # else what was found was the state of a plant before
+                    if error.code != ENDED:  # else the state found was of a previous plant
                         raise
             if self._clock.now_ns() > until_ns:
                 raise DriverError(
@@ -217,8 +218,8 @@ class PlantDriver:
         self._writer.close()
 
     def _call(self, *, active: bool, session: int) -> None:
-        """Order a lifecycle call, and nothing of what was ordered before, and wait for its answer. Raises DriverError:
-        what the drives say, or a plant that ended or does not answer.
+        """Order a lifecycle call, cancel all previous orders, and wait for the answer. Raises DriverError: the error of
+        the drives, or a plant that ended or does not answer.
         """
         self._send(
             active=active,
@@ -244,7 +245,7 @@ class PlantDriver:
     # -- motion ---------------------------------------------------------------------------------------------
 
     def read_state(self) -> JointState:
-        """The newest sample of the plant, which may have been read before. Raises DriverError."""
+        """The newest sample of the plant, even if it was read before. Raises DriverError."""
         state = self._state_of_session()
         self._raise_failure(state)
         if state.seq == 0:
@@ -252,10 +253,10 @@ class PlantDriver:
         return state.sample()
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
-        """Order velocities (n,); what was sent, and why, is of the order before. Raises DriverError."""
+        """Order velocities (n,); the report is on the previous order. Raises DriverError."""
         orders = self._orders
         asked = np.array(qd, dtype=np.float64)
-        # a product with zeros is not zero where something is infinite or NaN
+        # a product with zeros is not zero if a factor is infinite or NaN
         if asked.shape != orders.velocities.shape or asked.dot(self._zeros) != 0.0:
             raise DriverError(
                 "shape",
@@ -282,7 +283,7 @@ class PlantDriver:
     # -- auxiliary joints -----------------------------------------------------------------------------------
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Order auxiliary joints and outputs. Raises DriverError: there is no such name, or the plant ended."""
+        """Order auxiliary joints and outputs. Raises DriverError for an unknown name, or if the plant ended."""
         asked = self._orders.auxiliary.copy()
         for name, value in values.items():
             if name not in self._names:
@@ -300,7 +301,7 @@ class PlantDriver:
         return {name: value for name, value in found if value == value}
 
     def stop_auxiliary(self) -> None:
-        """Order auxiliary joints to stand where they are. Never raises."""
+        """Order auxiliary joints to hold their positions. Never raises."""
         self._send(auxiliary_stops=self._orders.auxiliary_stops + 1, auxiliary=np.full(len(self._names), np.nan))
 
     # -- records --------------------------------------------------------------------------------------------
@@ -308,7 +309,7 @@ class PlantDriver:
     def _send(self, **changes: Any) -> None:
         for name, value in changes.items():
             setattr(self._orders, name, value)
-        if not self._closed:  # a stop may come later than that; there is no power then
+        if not self._closed:  # `stop` may be called after `close`; the power is off then
             self._writer.write(self._orders.encoded())
 
     def _look(self) -> PlantState | None:
@@ -322,7 +323,7 @@ class PlantDriver:
         return self._state
 
     def _state_of_session(self) -> PlantState:
-        """The newest state of the plant that was configured. Raises DriverError: it has ended."""
+        """The newest state of the configured plant. Raises DriverError if it has ended."""
         state = self._look()
         if state is None or state.session != self._orders.session or not self._lives():
             raise DriverError(
@@ -333,7 +334,7 @@ class PlantDriver:
         return state
 
     def _lives(self) -> bool:
-        """Whether the process that wrote the newest state lives; looked at only where it says nothing."""
+        """Whether the process that wrote the newest state lives; checked only if it has been silent."""
         state = self._state
         if state is not None and self._clock.now_ns() - state.t_ns < SILENT_NS:
             return True

@@ -1,5 +1,5 @@
-"""Pictures of a camera for people to look at: encoded as JPEG by a niced thread of the vision process, only while the
-gateway asks for them, and passed to it through a slot.
+"""Preview images of a camera for display: encoded as JPEG by a niced thread of the vision process, only while the
+gateway requests them, and passed to it through a slot.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from stereoservo.ports.devices import Frame
 
 PICTURE_LAYOUT = "PreviewPicture.1"
 PICTURE_CAPACITY = 192 << 10
-"""Below the largest message of a zenoh session (`client.session.MAX_MESSAGE_BYTES`)."""
+"""Largest size [bytes], below the largest message of a zenoh session (`client.session.MAX_MESSAGE_BYTES`)."""
 WANTED_LAYOUT = "PreviewWanted.1"
 WANTED_BYTES = 8
 WANTED_S = 1.0
-"""A request holds so long; the gateway renews it while somebody subscribes."""
+"""Validity of a request [s]; the gateway renews it while there are subscribers."""
 WIDEST_PX = 640
 EVERY_NS = 60_000_000
-"""At most 16 pictures a second: every frame of a camera of 15 Hz."""
+"""Least interval of images [ns]: at most 16 per second, every frame of a 15 Hz camera."""
 QUALITIES = (75, 50, 25)
 NICENESS = 10
 
 
 class PreviewPicture(msgspec.Struct, frozen=True):
-    """A JPEG of one frame. ``width``, ``height``: of the frame [px], which the JPEG may show smaller."""
+    """A JPEG of one frame. ``width``, ``height``: of the frame [px]; the JPEG may be smaller."""
 
     camera: str
     seq: int
@@ -48,8 +48,8 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 def encode_jpeg(image: ImageArray) -> bytes:
-    """A picture (height, width) as JPEG, at most `WIDEST_PX` wide, at the best quality that the slot holds."""
-    import cv2  # not for the gateway and the supervisor, which know the slots
+    """An image (height, width) as JPEG, at most `WIDEST_PX` wide, at the best quality that fits into the slot."""
+    import cv2  # not imported by the gateway and the supervisor, which use only the slots
 
     step = -(-image.shape[1] // WIDEST_PX)
     if step > 1:
@@ -64,9 +64,10 @@ def encode_jpeg(image: ImageArray) -> bytes:
 
 
 class PreviewEncoder:
-    """Of one camera, in its vision process: `offer` takes each newest frame; a thread encodes while it is wanted.
+    """Preview encoder of one camera, in its vision process: `offer` takes each newest frame; a thread encodes while
+    previews are requested.
 
-    The thread starts with the first picture that is wanted. Raises SlotError where another process writes.
+    The thread starts with the first requested image. Raises SlotError if another process writes.
     """
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
@@ -81,7 +82,7 @@ class PreviewEncoder:
         self._thread: threading.Thread | None = None
 
     def offer(self, frame: Frame, now_ns: int) -> None:
-        """Hand over a copy of ``frame`` where one is wanted and the last one is old enough; never waits."""
+        """Pass a copy of ``frame`` to the encoder if one is requested and the last one is old enough; never waits."""
         request = self._wanted.poll()
         if request is not None and len(request) == WANTED_BYTES:
             (self._until_ns,) = struct.unpack("=q", request)
@@ -97,7 +98,7 @@ class PreviewEncoder:
             self._ready.notify()
 
     def _work(self) -> None:
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # Linux: of this thread alone
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # Linux: for this thread only
         told = False
         while True:
             with self._ready:
@@ -113,7 +114,7 @@ class PreviewEncoder:
                     frame.camera, frame.seq, frame.t_shutter_ns, width, height, encode_jpeg(frame.image)
                 )
                 self._slot.write(_encoder.encode(picture))
-            except Exception as error:  # a picture that cannot be shown must not cost the camera
+            except Exception as error:  # an image that cannot be encoded must not stop the camera
                 if not told:
                     write_log(f"vision-{self._camera}", f"no preview of a picture: {cause_of(error)}")
                 told = True
@@ -126,26 +127,24 @@ class PreviewEncoder:
         if self._thread is not None:
             self._thread.join(1.0)
             if self._thread.is_alive():
-                return  # it still writes: the process ends and takes both slots with it
+                return  # it still writes: both slots are released when the process ends
         self._wanted.close()
         self._slot.close()
 
 
 class PreviewRequest:
-    """The gateway's side of one camera's preview: asks for pictures, and reads the newest."""
+    """The gateway's side of one camera's preview: requests images, and reads the newest."""
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
         self._wanted = SlotWriter(directories.preview_wanted_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
         self._slot = SlotReader(directories.preview_slot(camera), PICTURE_LAYOUT)
 
     def ask(self) -> None:
-        """Ask for pictures for `WANTED_S` from now."""
+        """Request images for the next `WANTED_S` seconds."""
         self._wanted.write(struct.pack("=q", time.monotonic_ns() + int(WANTED_S * 1e9)))
 
     def poll(self) -> PreviewPicture | None:
-        """The newest picture, unless it was returned before or is older than a request holds. Raises what the decoder
-        raises.
-        """
+        """The newest image, unless returned before or older than `WANTED_S`. Raises the decoder's exceptions."""
         data = self._slot.poll()
         if data is None:
             return None

@@ -13,10 +13,9 @@ _PR_SET_PDEATHSIG = 1
 
 
 def die_with_parent(parent: int, how: signal.Signals) -> None:
-    """Have the kernel send ``how`` when the parent dies; exits at once where ``parent`` has already died.
+    """Make the kernel send ``how`` when the parent dies; exits at once if ``parent`` has already died.
 
-    The kernel watches the parent's *thread*, so processes must be spawned from a thread that lives as long
-    as it should.
+    The kernel watches the parent's *thread*, so the spawning thread must live as long as the process is needed.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(_PR_SET_PDEATHSIG, int(how), 0, 0, 0) != 0:
@@ -27,8 +26,8 @@ def die_with_parent(parent: int, how: signal.Signals) -> None:
 
 
 class Termination:
-    """Flag set by SIGTERM, SIGINT and hang-up of the terminal (SIGHUP, unless it is ignored: nohup). After the
-    first one the process has ``grace_s`` to end; then SIGALRM kills it.
+    """Flag set by SIGTERM, SIGINT and hang-up of the terminal (SIGHUP, unless ignored: nohup). After the first signal
+    the process has ``grace_s`` to end; then SIGALRM kills it.
     """
 
     def __init__(self, grace_s: float = 5.0) -> None:
@@ -54,13 +53,13 @@ class Termination:
 
 
 def write_log(process: str, message: str) -> None:
-    """Write one line to stderr; the journal adds the time. A full disk or a closed pipe there loses the line alone."""
+    """Write one line to stderr; the journal adds the time. With a full disk or a closed pipe only the line is lost."""
     with suppress(OSError, ValueError):
         print(f"stereoservo {process}: {message}", file=sys.stderr, flush=True)
 
 
 def child_environment() -> dict[str, str]:
-    """Environment of every child: one thread for BLAS, so that nothing competes with the loop."""
+    """Environment of every child: one thread for BLAS, so that it does not compete with the loop."""
     return {
         **os.environ,
         "OPENBLAS_NUM_THREADS": "1",

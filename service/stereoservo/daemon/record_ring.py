@@ -1,9 +1,9 @@
-"""Ring of records in shared memory, from the servo loop to the gateway: one writer, which never waits and never calls
-the system, and one reader.
+"""Ring of records in shared memory, from the servo loop to the gateway: one writer, which never waits and makes no
+system calls, and one reader.
 
-A record that does not fit is not written, and the writer knows. Each record carries a CRC-32 over its place and bytes,
-and the reader believes nothing else: Python cannot fence memory. The reader says by a word of its own that it has
-begun to read; the writer begins its stream anew for each such word.
+A record that does not fit is not written, which is reported to the writer. Each record has a CRC-32 over its position
+and bytes, and the reader relies on it alone, because Python has no memory fences. The reader announces by its own word
+that it has begun to read; the writer restarts its stream for each new word.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from stereoservo.daemon.seqlock import SlotError, create_slot, map_slot
 
 LAYOUT = "Records.1"
 CAPACITY = 4 << 20
-"""Bytes: some seconds of steps."""
+"""Capacity [bytes]: some seconds of steps."""
 _HEADER_BYTES = 64
-_WRITTEN_WORD, _READ_WORD, _READER_WORD = 5, 6, 7  # the words before are those of a slot
+_WRITTEN_WORD, _READ_WORD, _READER_WORD = 5, 6, 7  # the previous words are those of a slot
 _RECORD = struct.Struct("<II")
 _SKIP = 0xFFFFFFFF
-"""In place of a length: the next record is at the beginning of the ring."""
+"""Value of a length if the next record is at the beginning of the ring."""
 TRIES = 5
-"""Polls for which a record whose bytes do not fit its checksum is waited for: it may be on its way."""
+"""Number of polls to wait for a record with a wrong checksum: it may not be completely visible yet."""
 
 
 class RingWriter:
-    """The writer's end; creates the file where it is missing. Raises SlotError, OSError."""
+    """The writer's end; creates the file if it is missing. Raises SlotError, OSError."""
 
     def __init__(self, path: Path) -> None:
         create_slot(path, CAPACITY, LAYOUT)
@@ -42,17 +42,17 @@ class RingWriter:
 
     @property
     def reader(self) -> int:
-        """The word of the reader that has begun to read; 0: there is none."""
+        """The word of the current reader; 0: none."""
         return int(self._words[_READER_WORD])
 
     def write(self, record: bytes) -> bool:
-        """Append a record; False where there is no room for it now."""
+        """Append a record; False if there is no free space for it."""
         written, capacity = self._written, self._capacity
         size = 8 + len(record) + -len(record) % 8
         at = written % capacity
         skipped = capacity - at if at + size > capacity else 0
         used = written - self._words[_READ_WORD]
-        if not 0 <= used <= capacity:  # damaged: what waits is given up
+        if not 0 <= used <= capacity:  # damaged: pending records are discarded
             self._words[_WRITTEN_WORD] = self._words[_READ_WORD] = written
             return False
         if used + skipped + size > capacity:
@@ -72,7 +72,7 @@ class RingWriter:
 
 
 class RingReader:
-    """The reader's end. Raises SlotError where there is no such ring (yet)."""
+    """The reader's end. Raises SlotError if the ring does not exist (yet)."""
 
     def __init__(self, path: Path) -> None:
         self._mapping, self._capacity = map_slot(path, LAYOUT)
@@ -83,19 +83,19 @@ class RingReader:
         self.detach()
 
     def attach(self) -> None:
-        """Begin to read what is written from now on, and have the writer begin its stream anew."""
+        """Start reading at the current write position, and make the writer restart its stream."""
         self._words[_READ_WORD] = self._words[_WRITTEN_WORD]
         self._words[_READER_WORD] = time.monotonic_ns()
         self._tries, self.reading = 0, True
 
     def detach(self) -> None:
-        """Read no more: nothing is written for this reader."""
+        """Stop reading: nothing more is written for this reader."""
         self._words[_READER_WORD] = 0
         self.reading = False
 
     def read(self, limit: int) -> list[bytes]:
-        """Up to ``limit`` records, oldest first. Raises SlotError where the ring is damaged; then it is read anew,
-        from what is written from now on.
+        """Up to ``limit`` records, oldest first. Raises SlotError if the ring is damaged; reading then restarts at the
+        current write position.
         """
         found: list[bytes] = []
         at, end = self._words[_READ_WORD], self._words[_WRITTEN_WORD]
@@ -114,8 +114,8 @@ class RingReader:
         return found
 
     def _record(self, at: int, end: int) -> tuple[bytes | None, int]:
-        """The record at a place, None for one that leads to the beginning, and where the next one is; -1 where its
-        bytes do not fit.
+        """The record at position ``at`` (None for a jump to the beginning), and the next position; -1 if it is
+        invalid.
         """
         place = at % self._capacity
         if at % 8 or not 0 < end - at <= self._capacity:
@@ -131,7 +131,7 @@ class RingReader:
         return (record, after) if zlib.crc32(record, at & 0xFFFFFFFF) == crc else (None, -1)
 
     def close(self) -> None:
-        """Read no more, and release the mapping. Idempotent."""
+        """Stop reading, and release the mapping. Idempotent."""
         if self._mapping.fd >= 0:
             self.detach()
             self._words = self._bytes = memoryview(b"")

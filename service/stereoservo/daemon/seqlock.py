@@ -1,10 +1,9 @@
 """Shared-memory slots with a sequence lock, which pass only the newest record between processes; and the stop slot, a
-word that any process may raise to stop the arm.
+word that any process may set to stop the arm.
 
-Python cannot fence memory (aarch64 may reorder the stores), so the sequence lock is only the fast path:
-every record carries a CRC-32 over its sequence number and bytes, and a reader believes nothing else. Files
-are created once, by the supervisor or the first writer, and keep their inode for the cell's life, so that
-a restarted process finds the slot it left.
+Python has no memory fences (aarch64 may reorder stores), so the sequence lock is only the fast path: every record has a
+CRC-32 over its sequence number and bytes, and a reader relies on it alone. Files are created once, by the supervisor or
+the first writer, and keep their inode during the cell's life, so that a restarted process finds its slot again.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ _HEADER_BYTES = 64
 _MAGIC_WORD, _LAYOUT_WORD, _CAPACITY_WORD, _PID_WORD, _EPOCH_WORD, _SEQUENCE_WORD, _LENGTH_WORD, _CRC_WORD = range(8)
 
 _STATE = struct.Struct("@3Q")  # native: whole words, as the memory views write them
-"""Sequence number, length and CRC of a record, which lie one behind the other from `_STATE_AT` on."""
+"""Sequence number, length and CRC of a record, stored consecutively from `_STATE_AT` on."""
 _STATE_AT = 8 * _SEQUENCE_WORD
 
 _STOP_MAGIC = 0x53_53_54_4F_50_31  # "SSTOP1"
@@ -34,7 +33,7 @@ _STOP_MAGIC_WORD, _RAISED_WORD, _ACKNOWLEDGED_WORD, _COUNT_WORD = range(4)
 
 
 class SlotError(Exception):
-    """A slot cannot be used: names the file, its content and what was expected.
+    """A slot cannot be used: the message names the file, its content and the expected content.
 
     Attributes:
         path: the slot's file.
@@ -56,9 +55,9 @@ def layout_hash(layout: str) -> int:
 def create_slot(path: Path, capacity: int, layout: str) -> bool:
     """Create the file of a slot for records of up to ``capacity`` bytes; returns whether anything had to be written.
 
-    An existing one of that layout is left as it is. Another one is overwritten in place: processes may have it mapped,
-    and where it is shorter, their next access would kill them. Raises OSError, also where there is no memory for all
-    of it.
+    An existing file of that layout is not changed. A file of another layout is overwritten in place: processes may have
+    it mapped, and if it became shorter, their next access would kill them. Raises OSError, also if there is not enough
+    memory for the whole file.
     """
     size = _HEADER_BYTES + capacity
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -69,9 +68,9 @@ def create_slot(path: Path, capacity: int, layout: str) -> bool:
         if header == expected and found == size:
             return False
         os.ftruncate(fd, size)
-        os.posix_fallocate(fd, 0, size)  # a hole, where the memory is full, would kill whoever writes there
+        os.posix_fallocate(fd, 0, size)  # with full memory, a write into a hole would kill the writing process
         if found != size:
-            os.pwrite(fd, bytes(size), 0)  # what lies between belongs to another layout
+            os.pwrite(fd, bytes(size), 0)  # the bytes in between belong to another layout
         os.pwrite(fd, expected, 0)
         return True
     finally:
@@ -113,7 +112,7 @@ class Mapping:
 
 
 def map_slot(path: Path, layout: str) -> tuple[Mapping, int]:
-    """The file of a slot or ring, mapped, and its capacity. Raises SlotError."""
+    """The mapped file of a slot or ring, and its capacity. Raises SlotError."""
     mapping = Mapping(path, _HEADER_BYTES)
     magic, found, capacity = (
         mapping.words[_MAGIC_WORD],
@@ -149,12 +148,12 @@ class SlotWriter:
             raise SlotError(path, "busy", f"already written by process {pid}; a slot has one writer") from error
         words = self._mapping.words
         sequence = words[_SEQUENCE_WORD] + (words[_SEQUENCE_WORD] & 1)  # a crash may have left it odd
-        self._sequence = sequence if sequence < _LARGEST_WORD // 2 else 0  # else damaged: it must still grow
+        self._sequence = sequence if sequence < _LARGEST_WORD // 2 else 0  # else damaged: it must be able to grow
         words[_PID_WORD] = os.getpid()
         words[_EPOCH_WORD] = (words[_EPOCH_WORD] + 1) & _LARGEST_WORD
 
     def write(self, record: bytes) -> None:
-        """Replace the record. Raises SlotError where it is longer than the capacity."""
+        """Replace the record. Raises SlotError if it is longer than the capacity."""
         length = len(record)
         if length > self._capacity:
             raise SlotError(self._path, "too_large", f"record of {length} bytes; the slot holds up to {self._capacity}")
@@ -178,10 +177,10 @@ class SlotWriter:
 
 
 class SlotReader:
-    """A reader of a slot; there may be any number.
+    """A reader of a slot, one of any number.
 
-    ``torn`` counts reads that met a writer at work and were retried; ``missed`` counts polls that gave up
-    after ``retries`` of them (the record is then taken at the next poll).
+    ``torn`` counts reads that collided with a write and were retried; ``missed`` counts polls that gave up after
+    ``retries`` retries (the record is then read at the next poll).
     """
 
     def __init__(self, path: Path, layout: str, *, retries: int = 8) -> None:
@@ -194,7 +193,7 @@ class SlotReader:
 
     @property
     def epoch(self) -> int:
-        """Number of writers this slot has had."""
+        """Number of writers that this slot has had."""
         return int(self._mapping.words[_EPOCH_WORD])
 
     @property
@@ -209,7 +208,7 @@ class SlotReader:
             return False
         try:
             os.kill(pid, 0)
-        except (ProcessLookupError, PermissionError):  # its number may be another user's by now
+        except (ProcessLookupError, PermissionError):  # the process id may now belong to another user
             return False
         return True
 
@@ -218,7 +217,7 @@ class SlotReader:
         return self._read(skip=self._seen)
 
     def newest(self) -> bytes | None:
-        """The newest record, read before or not; None where there is none yet."""
+        """The newest record, even if it was read before; None if there is none yet."""
         return self._read(skip=0)
 
     def _read(self, skip: int) -> bytes | None:
@@ -227,10 +226,10 @@ class SlotReader:
             if words[_SEQUENCE_WORD] in (skip, 0):
                 return None
             sequence, length, crc = _STATE.unpack_from(self._bytes, _STATE_AT)
-            # a writer that was interrupted has left zeros, of which the CRC is zero too
+            # an interrupted writer has left zeros, whose CRC is zero, too
             if sequence and not sequence & 1 and length <= self._capacity:
                 record = self._bytes[_HEADER_BYTES : _HEADER_BYTES + length].tobytes()
-                # A writer that was here meanwhile has left another number, or bytes that do not fit.
+                # A concurrent writer has changed the number, or left bytes with a wrong CRC.
                 if zlib.crc32(record, sequence & 0xFFFFFFFF) == crc and words[_SEQUENCE_WORD] == sequence:
                     self._seen = sequence
                     return record
@@ -259,7 +258,7 @@ def create_stop_slot(path: Path) -> None:
 
 
 def repair_stop_slot(path: Path) -> bool:
-    """Write the mark of a stop slot that has lost it, its words untouched; returns whether that was needed."""
+    """Restore the magic number of a damaged stop slot, its other words unchanged; returns whether that was needed."""
     fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
     try:
         mark = struct.pack("=Q", _STOP_MAGIC)
@@ -273,10 +272,11 @@ def repair_stop_slot(path: Path) -> bool:
 
 
 class StopSlot:
-    """A word in shared memory that any process may raise; the servo process reads and acknowledges it each cycle.
+    """A word in shared memory by which any process can raise a stop; the servo process reads and acknowledges it each
+    cycle.
 
-    Two processes that raise it at once both write a fresh word; whichever wins, the reader sees a change.
-    The count is for people to read and may miss one of two simultaneous raises.
+    If two processes raise it simultaneously, both write a new word; whichever is written last, the reader detects a
+    change. The count is informative only and may miss one of two simultaneous raises.
     """
 
     def __init__(self, path: Path) -> None:
@@ -291,14 +291,14 @@ class StopSlot:
         words = self._mapping.words
         now = time.monotonic_ns()
         word = max(now, words[_RAISED_WORD] + 1)
-        if word > _LARGEST_WORD:  # damaged: any other word stops the arm
+        if word > _LARGEST_WORD:  # damaged: any changed word stops the arm
             word = now
         words[_RAISED_WORD] = word
         words[_COUNT_WORD] = (words[_COUNT_WORD] + 1) & _LARGEST_WORD
         return word
 
     def acknowledged(self, word: int) -> bool:
-        """Whether the servo process has seen the stop ``word`` or a later one."""
+        """Whether the servo process has read the stop ``word`` or a later one."""
         return bool(self._mapping.words[_ACKNOWLEDGED_WORD] >= word)
 
     @property

@@ -1,9 +1,9 @@
 """The servo loop and its process: each cycle reads joints and camera observations, runs one step of the control core,
 commands the joint driver, and publishes the result.
 
-`ServoProcess` is the loop on given links, pacing and clock; `main` runs it as a process of its own. That process holds
-nothing that could delay the arm: no zenoh, no scipy solver, no images, and it logs at its start and end only. Whatever
-ends it, the drives are stopped. ``python -m stereoservo.daemon.servo RUNTIME_DIRECTORY PARENT_PID``.
+`ServoProcess` is the loop on given links, pacing and clock; `main` is the entry of its process. The process contains
+nothing that could delay the arm: no zenoh, no scipy solver, no images, and it logs only at its start and end. In every
+case the drives are stopped at its end. ``python -m stereoservo.daemon.servo RUNTIME_DIRECTORY PARENT_PID``.
 """
 
 from __future__ import annotations
@@ -46,32 +46,34 @@ from stereoservo.ports.devices import AuxiliaryDriver, Clock, DriverError, Joint
 from stereoservo.recording.step_records import StepStream
 
 GATEWAY_SILENCE_S = 0.5
-"""Without a heartbeat of the gateway for so long, a moving arm is held."""
+"""Time without a heartbeat of the gateway after which a moving arm is held [s]."""
 SILENCE = f"the servo process: its gateway said nothing for {GATEWAY_SILENCE_S:g} s (a busy computer?)"
-"""The operator's name in the event `held` that follows."""
+"""Operator name in the resulting event `held`."""
 UNHEARD_S = 0.15
-"""Without a heartbeat of the gateway for so long (three of them), it hears no client either: no lease runs."""
+"""Time without a heartbeat of the gateway (three beats) after which leases do not run [s], because the gateway receives
+no client messages either.
+"""
 RETURN_S = 2.0
-"""So long after a silence that held the arm clients may need to find a gateway that was started anew."""
+"""Time that clients may need to find a restarted gateway after a silence that held the arm [s]."""
 AHEAD_S = 0.05
-"""How often, and by how much ahead, leases are extended meanwhile."""
+"""Interval and lead time of lease extensions in the meantime [s]."""
 STATE_RATE_HZ = 50.0
 STATISTICS_EVERY_S = 0.5
 FAULT_READ_EVERY_S = 0.1
-"""How often a driver in fault is read."""
+"""Interval of reading a driver in fault [s]."""
 REST_TIMEOUT_S = 1.5
-"""How long a shutdown waits for the core to bring the arm to rest before the driver's own stop."""
+"""Time for which a shutdown waits for the core to bring the arm to rest before the driver's own stop [s]."""
 CONFIGURE_TRIES = 20
 CONFIGURE_PAUSE_S = 0.5
 EXIT_SETUP = 3
 
 
 class ServoProcess:
-    """The servo loop of one cell, a cycle at a time, on any links, pacing and clock.
+    """The servo loop of one cell, cycle by cycle, on any links, pacing and clock.
 
-    ``dry_run``: the core's commands and requests are computed and never reach the drives. ``beat``: told in every
-    cycle, and before what may take longer, within how many seconds it is told again. ``kernels``: those that are not
-    compiled yet; they are loaded once they are, a kernel at a time in cycles in which nothing moves.
+    ``dry_run``: the core's commands and requests are computed, but not sent to the drives. ``beat``: called in every
+    cycle, and before longer operations, with the time limit of its next call [s]. ``kernels``: loader of kernels that
+    are not compiled yet; they are loaded once they are compiled, one per cycle in which nothing moves.
     """
 
     def __init__(
@@ -133,7 +135,7 @@ class ServoProcess:
             self.driver.close()
 
     def _stop(self) -> None:
-        # In a dry run another process may be driving this arm: not even a stop is sent.
+        # In a dry run another process may control this arm: not even a stop is sent.
         if not self._dry_run:
             self.driver.stop()
 
@@ -173,7 +175,7 @@ class ServoProcess:
             self._sent = np.array(report.sent, dtype=np.float64)
 
     def _order_auxiliary(self, inputs: StepInputs, outputs: NewestStep, now_ns: int) -> None:
-        """Hand orders of auxiliary joints, which the core has accepted, to the driver; a stop stops them, too."""
+        """Pass orders of auxiliary joints that the core has accepted to the driver; a stop stops these joints, too."""
         if self._auxiliary is None or self._dry_run:
             return
         for request in inputs.requests:
@@ -184,7 +186,7 @@ class ServoProcess:
                     self._auxiliary.write_auxiliary(request.command.values)
                 except DriverError as error:
                     self._latch_fault(error, now_ns)
-        # After the orders: what stops the arm in this cycle, a contact say, may come after their answers.
+        # After the orders: a stop in this cycle, for example after a collision, may follow their answers.
         if inputs.stop or any(event.kind in ("stopped", "fault") for event in outputs.events):
             self._auxiliary.stop_auxiliary()
 
@@ -194,7 +196,7 @@ class ServoProcess:
         return self._auxiliary.read_auxiliary()
 
     def _apply_driver_request(self, outputs: NewestStep, now_ns: int) -> None:
-        """Change the driver's state as the core requests; where the driver refuses, the next step sees a fault."""
+        """Change the driver's state as requested by the core; if the driver refuses, the next step receives a fault."""
         request = outputs.driver_request
         if request == "":
             return
@@ -218,8 +220,8 @@ class ServoProcess:
     # -- gateway --------------------------------------------------------------------------------------------
 
     def _receive(self, now_ns: int) -> GatewayMessages:
-        """The gateway's messages; a hold is added where it has been silent and the arm moves, and leases do not run
-        while it hears no client.
+        """The gateway's messages. A hold is added if the gateway is silent while the arm moves; leases do not run while
+        the gateway receives no client messages.
         """
         messages = self._links.receive()
         if messages.heard:
@@ -236,7 +238,7 @@ class ServoProcess:
         return messages
 
     def _extend_leases(self, messages: GatewayMessages, now_ns: int) -> GatewayMessages:
-        """``messages`` and, where it is due, a request that gives clients the time in which nobody hears them."""
+        """``messages`` and, if due, a request that extends the leases by the time in which clients are not heard."""
         if self._extended_until_ns - now_ns >= AHEAD_S * 1e9:
             return messages
         since_ns = max(self._heard_ns, self._extended_until_ns)
@@ -266,13 +268,13 @@ class ServoProcess:
             )
             self._links.publish_state(state)
         self._cycles += 1
-        self._links.publish_events(events)  # after the state: who hears an event finds none older
+        self._links.publish_events(events)  # after the state: a receiver of an event finds a state that is not older
 
     # -- one cycle ------------------------------------------------------------------------------------------
 
     def cycle(self, pacing: Pacing, *, stop: bool = False) -> StepInputs:
-        """Run one cycle: wait, read, step, write, publish; the inputs of its step. ``stop`` requests the core to brake
-        (shutdown).
+        """Run one cycle: wait, read, step, write, publish; returns the inputs of its step. ``stop`` requests the core
+        to brake (shutdown).
         """
         pacing.wait()
         now_ns = self._clock.now_ns()
@@ -280,7 +282,7 @@ class ServoProcess:
         messages = self._receive(now_ns)
         observations = self._links.observations()
         inputs = StepInputs(
-            now_ns=self._clock.now_ns(),  # after everything was read: no stamp can be later
+            now_ns=self._clock.now_ns(),  # after all reads: no stamp can be later
             period_ns=self._period_ns,
             joints=joints,
             observations=observations,
@@ -310,13 +312,13 @@ class ServoProcess:
         return inputs
 
     def _load_kernels(self, kernels: KernelLoader, now_ns: int) -> None:
-        """Load the next kernel, if it is time. Never compiles: what is loaded is in the cache."""
+        """Load the next kernel, if it is time. Never compiles: the loaded kernels are in the cache."""
         kernels.advance(now_ns)
         if kernels.loaded:
             self._kernels = None
 
     def come_to_rest(self, pacing: Pacing, cut_short: Callable[[], bool]) -> None:
-        """Cycle until the core's command is zero, at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
+        """Run cycles until the core's command is zero, for at most ``REST_TIMEOUT_S`` or until ``cut_short``."""
         until = self._clock.now_ns() + int(REST_TIMEOUT_S * 1e9)
         first = True
         while not cut_short() and self._clock.now_ns() < until:
@@ -328,7 +330,7 @@ class ServoProcess:
 
 
 def _configure(process: ServoProcess, termination: Termination, clock: MonotonicClock) -> None:
-    """Connect, with retries where the driver's error allows it. Raises DriverError."""
+    """Connect, with retries if the driver's error allows it. Raises DriverError."""
     for attempt in range(CONFIGURE_TRIES):
         try:
             process.configure()
@@ -347,10 +349,10 @@ def run(plan: RunPlan, termination: Termination) -> None:
     locks = [FileLock(directories.servo_lock, f"cell {plan.cell.cell.name!r}")]
     if hardware is not None:
         locks.append(ChannelLock(hardware, f"joint driver {plan.cell.joints.driver!r} with these options"))
-    # Compiled kernels are loaded now, not in the middle of a cycle.
+    # Compiled kernels are loaded here, not within a cycle.
     kernels = kernels_to_come()
     if kernels is not None and hardware is not None:
-        # A kernel that is loaded holds up every thread of this process, a bus's too, for longer than drives wait.
+        # Loading a kernel blocks all threads of this process, also a bus's, for longer than the drives' time-out.
         wait_until_compiled(lambda: termination.asked)
         kernels = None
     if kernels is None:
@@ -374,7 +376,7 @@ def run(plan: RunPlan, termination: Termination) -> None:
             kernels=kernels,
         )
         try:
-            # Before the drives are asked for: collecting garbage holds up every thread of this process, a driver's too.
+            # Before the drives are connected: garbage collection blocks all threads of this process, also a driver's.
             for warning in prepare_realtime(plan.cell.servo.priority):
                 write_log("servo", warning)
             _configure(process, termination, clock)
@@ -397,7 +399,7 @@ def main() -> int:
     runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination()
-    tell_progress(runtime, "servo", parent)  # of what no other process has compiled: where no cache can be written
+    tell_progress(runtime, "servo", parent)  # of the kernels that this process compiles itself, if no cache is writable
     try:
         run(load_plan(runtime), termination)
     except DriverError as error:

@@ -33,12 +33,12 @@ from stereoservo.ports.devices import CameraObservation, Prior
 from stereoservo.recording.step_records import StepMessage
 
 RETAINED_EVENTS = 2048
-"""The last ones, whether they were received or not: a gateway that is started anew is sent them all."""
+"""Number of newest events that are kept, even if received: they are all sent to a restarted gateway."""
 NOTHING_WAITS = GatewayMessages(False, (), None)
 
 
 class _RecorderPeer:
-    """A reader of the ring of step records, as a `StepSink`; what is too large for the ring is not taken."""
+    """A reader of the ring of step records, as a `StepSink`; messages too large for the ring are not accepted."""
 
     def __init__(self, ring: RingWriter, reader: int) -> None:
         self._ring = ring
@@ -49,7 +49,7 @@ class _RecorderPeer:
 
 
 class ProcessLinks:
-    """`ServoLinks` of the servo process. Raises SlotError where a slot is missing or has another writer."""
+    """`ServoLinks` of the servo process. Raises SlotError if a slot is missing or has another writer."""
 
     def __init__(self, directories: CellDirectories, cameras: tuple[str, ...]) -> None:
         self._stop = StopSlot(directories.stop_slot)
@@ -64,16 +64,16 @@ class ProcessLinks:
         self._steps = RingWriter(directories.steps_ring)
         self._gateway: PacketChannel | None = None
         self._greeted = False
-        """Whether the gateway has said which events it has: before that it is sent none."""
+        """Whether the gateway has reported which events it has; no events are sent to it before that."""
         self._recorder: _RecorderPeer | None = None
         self._outbox = Outbox(RETAINED_EVENTS)
         self._waiting = select.epoll()
-        """Tells in one call whether a peer or a message waits; what is closed leaves it by itself."""
+        """Reports in one call whether a peer or a message waits; closed sockets are removed automatically."""
         self._waiting.register(self._control.fileno(), select.EPOLLIN)
 
     def receive(self) -> GatewayMessages:
-        """Requests and model of the gateway; a message that does not decode is left out. One that was started anew
-        replaces the one before, whose last words are taken first.
+        """Requests and model of the gateway; a message that cannot be decoded is skipped. A restarted gateway replaces
+        the previous one, whose last messages are received first.
         """
         if not self._waiting.poll(0):
             return NOTHING_WAITS
@@ -102,7 +102,7 @@ class ProcessLinks:
         return found
 
     def observations(self) -> tuple[CameraObservation, ...]:
-        """The newest observation of each camera that was not returned before; what does not decode is left out."""
+        """The newest observation of each camera, unless returned before; records that cannot be decoded are skipped."""
         found = []
         for reader, boundary in self._observations:
             data = reader.poll()
@@ -116,7 +116,7 @@ class ProcessLinks:
         return self._stop.poll()
 
     def step_recorder(self) -> _RecorderPeer | None:
-        """The reader of the ring of step records, while there is one."""
+        """The reader of the ring of step records, if there is one."""
         reader = self._steps.reader
         known = 0 if self._recorder is None else self._recorder.reader
         if reader != known:
@@ -128,7 +128,7 @@ class ProcessLinks:
         self._priors[prior.camera].write(encode_prior(prior))
 
     def publish_state(self, state: ServoState) -> None:
-        """Write the state slot, with notes on the records that were left out."""
+        """Write the state slot, with notes on skipped records."""
         boundaries = (self._gateway_boundary, *(boundary for _, boundary in self._observations))
         if any(boundary.refused for boundary in boundaries):
             notes = tuple(boundary.note for boundary in boundaries if boundary.refused)
@@ -136,7 +136,7 @@ class ProcessLinks:
         self._state.write(encode(state))
 
     def publish_events(self, events: tuple[Event, ...]) -> None:
-        """Queue events and send those that wait, as far as the gateway's socket accepts them."""
+        """Queue events and send the queue, as far as the gateway's socket accepts it."""
         for event in events:
             self._outbox.add(event.seq, encode(event))
         if self._gateway is not None and self._greeted and self._gateway.is_open:

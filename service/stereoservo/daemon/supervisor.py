@@ -1,10 +1,9 @@
-"""The supervisor of a daemon: starts, monitors and restarts the processes of one cell (servo, vision, gateway, and of a
-simulated cell its plant), and owns its lock and runtime directory.
+"""The supervisor of a daemon: starts, monitors and restarts the processes of one cell (servo, vision, gateway, and the
+plant of a simulated cell), and owns its lock and runtime directory.
 
-A gateway, vision or plant process that ends is started again after a growing pause. The servo process is never
-started again: when it ends, everything stops. A process that hangs (its heartbeat is late) is killed, and
-counts as one that ended. Children die with the supervisor, whatever kills it (the servo process in good
-order).
+A gateway, vision or plant process that ends is restarted after a growing pause. The servo process is never restarted:
+when it ends, everything stops. A process that hangs (its heartbeat is late) is killed and treated as ended. Children
+die with the supervisor in all cases (the servo process with an orderly shutdown).
 """
 
 from __future__ import annotations
@@ -59,30 +58,32 @@ from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 300.0
-"""So long the processes may take to be ready after the last kernel that was compiled for them."""
+"""Time limit for the processes to be ready after the last compilation of a kernel for them [s]."""
 TELL_EVERY_S = 10.0
-"""How often the log tells how far the compilation is, where it goes on."""
+"""Interval of progress lines in the log while kernels are compiled [s]."""
 SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 10.0
 WATCH_EVERY_S = 0.05
 LATE_S = 0.25
-"""A supervisor that looks so late was itself without a processor: what it did not see it counts against nobody."""
+"""Delay of the supervisor's check [s] above which it was itself stalled: the silence of a process does not count
+then.
+"""
 AFTER_SERVO = (
     "The drives stop by themselves without its commands. See what it logged last, and `stereoservo doctor` on the "
     "drives, before you run the cell again"
 )
 STEADY_S = 30.0
-"""A process that lived for so long starts again after the shortest pause."""
+"""Lifetime of a process [s] after which it is restarted with the shortest pause."""
 
 
 class StartError(Exception):
-    """The daemon cannot start; the text is for the operator."""
+    """The daemon cannot start; the message is for the operator."""
 
 
 class ServoDiedError(Exception):
-    """The servo process ended by itself or hung, which is the ``cause``; everything was stopped."""
+    """The servo process ended or hung, see ``cause``; everything was stopped."""
 
     def __init__(self, cause: str) -> None:
         super().__init__(f"{cause}. {AFTER_SERVO}")
@@ -91,7 +92,7 @@ class ServoDiedError(Exception):
 
 @dataclass
 class Child:
-    """One supervised process. ``hung``: how, where it was killed for that."""
+    """One supervised process. ``hung``: description of the hang for which it was killed."""
 
     name: str
     arguments: list[str]
@@ -105,7 +106,7 @@ class Child:
 
 
 class Compilation:
-    """The process that compiles what a first start lacks, niced, beside all others."""
+    """The niced process that compiles the missing kernels at a first start, while all others run."""
 
     def __init__(self, runtime: Path) -> None:
         self._runtime = runtime
@@ -113,7 +114,7 @@ class Compilation:
         self._due: float | None = 0.0
 
     def look(self, now: float) -> str:
-        """Start it where it is due; returns how it failed, once, else ''."""
+        """Start it if it is due; returns how it failed, once, else ''."""
         if self._process is None:
             if self._due is not None and now >= self._due:
                 arguments = [str(os.getpid()), "beside", str(self._runtime)]
@@ -173,7 +174,7 @@ class Supervisor:
                     self.look(time.monotonic())
                     time.sleep(WATCH_EVERY_S)
         except ServoDiedError as error:
-            # Before the gateway ends, which tells it.
+            # Before the gateway ends, which reports it.
             record_run(partial(end_run, self.plan.directories, error.cause, AFTER_SERVO))
             raise
         finally:
@@ -196,7 +197,7 @@ class Supervisor:
             time.sleep(0.02)
 
     def look(self, now: float) -> None:
-        """Start what is due, and take note of what has ended or hangs. Raises ServoDiedError."""
+        """Start the processes that are due, and handle those that have ended or hang. Raises ServoDiedError."""
         late = now - self._looked_s > LATE_S
         self._looked_s = now
         for child in self.children:
@@ -220,7 +221,7 @@ class Supervisor:
         self._reporter.flush()
 
     def _ended(self, child: Child, how: str, now: float) -> None:
-        """A process has ended: it is started again after a pause, unless it is the servo process."""
+        """Handle the end of a process: it is restarted after a pause, unless it is the servo process."""
         if child is self.servo:
             self._servo_ended(how)
         kind = "process_hung" if child.hung else "process_ended"
@@ -262,7 +263,7 @@ def _spawn(arguments: list[str]) -> subprocess.Popen[bytes]:
         stdin=subprocess.DEVNULL,
         stdout=sys.stderr,
         env=child_environment(),
-        start_new_session=True,  # Ctrl-C goes to the supervisor, which ends them in order
+        start_new_session=True,  # Ctrl-C goes to the supervisor, which ends its children in order
     )
 
 
@@ -280,14 +281,14 @@ def _end(children: list[Child], grace_s: float) -> None:
 
 
 class ProgressLines:
-    """Lines in the log on how many kernels are compiled."""
+    """Log lines on the number of compiled kernels."""
 
     def __init__(self) -> None:
         self._due_s = time.monotonic() + TELL_EVERY_S
         self._said = ""
 
     def look(self, runtime: Path) -> None:
-        """Tell where it is time, and there is something new."""
+        """Log the progress, if it is time and there is progress."""
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + TELL_EVERY_S
@@ -360,9 +361,9 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
 
 
 def restore(plan: RunPlan) -> list[str]:
-    """Write again what a child needs in the runtime directory and no longer finds there whole; returns what that was.
+    """Rewrite damaged or missing files that children need in the runtime directory; returns messages on these.
 
-    Without this a damaged file would end each new child at its start, for ever.
+    Otherwise a damaged file would end every new child at its start, forever.
     """
     directories = plan.directories
     told = []
@@ -383,7 +384,7 @@ def restore(plan: RunPlan) -> list[str]:
 
 
 def record_run(write: Callable[[], None]) -> None:
-    """Write the record of this run by ``write``; a disk that does not take it holds up nothing."""
+    """Write the record of this run by ``write``; an error of the disk does not stop the daemon."""
     try:
         write()
     except OSError as error:
@@ -391,8 +392,8 @@ def record_run(write: Callable[[], None]) -> None:
 
 
 def clean(directories: CellDirectories) -> None:
-    """Remove the files of a run from the runtime directory, except lock files, and files that another process (an
-    emulator) holds by a lock ``NAME.lock`` beside them.
+    """Remove the files of a run from the runtime directory, except lock files, and files for which another process (an
+    emulator) holds a lock ``NAME.lock`` in the same directory.
     """
     if not directories.runtime.is_dir():
         return
@@ -427,7 +428,7 @@ def run_cell(
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
         compilation = Compilation(directories.runtime)
         try:
-            compilation.look(0.0)  # beside the preparation and, niced, beside the work
+            compilation.look(0.0)  # during the preparation and, niced, during operation
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")

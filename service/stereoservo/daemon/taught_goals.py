@@ -1,9 +1,9 @@
-"""Taught goals (set-points observed at teaching, with the cameras of the model in use then), and the JSON file that
+"""Taught goals (set-points observed at teaching, with the cameras of the model at that time), and the JSON file that
 stores them by name, with migration of older files.
 
-Schema 2 keeps beside the set-points of the moving body all other markers that were seen (the workpiece's, the tool's)
-and the cameras of the model, so that a goal can be transferred to the workpiece's present pose or to other cameras.
-Files of schema 1 are read; what they lack is taken from the model file of their epoch, where it still exists.
+Schema 2 stores, in addition to the set-points of the moving body, all other observed markers (of the workpiece and the
+tool) and the cameras of the model, so that a goal can be transferred to the workpiece's current pose or to other
+cameras. Files of schema 1 are read; missing data are taken from the model file of their epoch, if it still exists.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SCHEMA = 2
 READABLE_SCHEMAS = (1, 2)
 MAX_TAUGHT_BYTES = 1 << 26
 ModelOf = Callable[[int], CellModel | None]
-"""The model of an epoch, None where its file is gone."""
+"""The model of an epoch, None if its file no longer exists."""
 
 
 class TaughtFileError(DamagedError):
@@ -45,7 +45,7 @@ class TaughtCamera(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The part of the model at the time of teaching that interprets the pixels: its cameras and its frame.
 
-    ``plane_at_infinity`` (4,), ``projective_to_euclidean`` 4x4 row by row, where the stratum has it.
+    ``plane_at_infinity`` (4,), ``projective_to_euclidean`` 4x4 row by row, if the stratum has it.
     """
 
     epoch: int
@@ -58,10 +58,10 @@ class TaughtModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class TaughtGoal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One taught goal, pixels raw.
 
-    ``target``: set-points of the moving body by camera and marker; ``others``: pixels of all other markers, alike;
-    ``sigmas``: standard deviations [px] of either, where known. ``joints`` at that moment, ``created`` its wall time.
-    ``tool``: the features by which the goal is meant, when they are not the body's own markers. ``model`` is None where
-    the file of schema 1 was written with a model whose file is gone.
+    ``target``: set-points of the moving body by camera and marker; ``others``: pixels of all other markers, in the same
+    form; ``sigmas``: standard deviations [px] of both, if known. ``joints`` and ``created`` (wall time): at the time of
+    teaching. ``tool``: the features that define the goal, if they are not the body's own markers. ``model`` is None for
+    a file of schema 1 whose model file no longer exists.
     """
 
     target: FeatureTarget
@@ -128,8 +128,8 @@ def taught_model(model: CellModel) -> TaughtModel:
 
 
 def refined_goal(goal: TaughtGoal, used: CellModel, model: CellModel) -> TaughtGoal:
-    """The goal after an on-line refinement of model ``used`` to ``model``: its pixels are what they were, for nothing
-    moved, and the cameras that saw them, where they are those of ``used``, are better known.
+    """The goal after an on-line refinement of model ``used`` to ``model``. Its pixels are unchanged, because nothing
+    moved; its cameras, if they are those of ``used``, are replaced by the refined ones.
     """
     if goal.model is None:
         return goal
@@ -163,8 +163,8 @@ def _some(pixels: dict[str, dict[int, Pixel]], body: tuple[int, ...], *, of_body
 
 
 def load_taught(path: Path, model_of: ModelOf = lambda _: None) -> dict[str, TaughtGoal]:
-    """All taught goals of a cell; none where there is no file. ``model_of``: returns the model of an epoch, for
-    goals of schema 1.
+    """All taught goals of a cell; empty if there is no file. ``model_of``: returns the model of an epoch, for goals of
+    schema 1.
 
     Raises TaughtFileError.
     """

@@ -1,8 +1,8 @@
 """The vision loop of one camera: polls the driver, detects the markers near their predicted pixels, publishes the
 newest observation, and records images on request.
 
-`camera_loop` is the loop on given links and clock; `main` runs it as a process of its own. Errors of the camera are
-reported and answered by reconnecting with growing pauses, never by ending.
+`camera_loop` is the loop on given links and clock; `main` is the entry of its process. After an error of the camera,
+the loop reports it and reconnects with growing pauses; it never ends.
 ``python -m stereoservo.daemon.vision RUNTIME_DIRECTORY PARENT_PID CAMERA``.
 """
 
@@ -61,17 +61,17 @@ if TYPE_CHECKING:
 FIRST_PAUSE_S = 0.2
 LONGEST_PAUSE_S = 5.0
 SILENT_CAMERA_S = 2.0
-"""A camera that delivers nothing for so long is closed and opened again."""
+"""Time without data after which a camera is closed and reopened [s]."""
 QUIET_PERIODS = 0.6
-"""Of a camera, after a frame, in which nobody looks for the next one: one that is so early is taken a little later."""
+"""Fraction of a camera's period after a frame without polling: an earlier frame is received a little later."""
 LOOKS = 2
-"""For a frame, in vain: with more of them the next one is looked for later."""
+"""Number of unsuccessful polls per frame above which polling for the next frame starts later."""
 PRIOR_MAX_AGE_S = 0.5
 EXIT_SETUP = 3
 
 
 class VisionSlots:
-    """`VisionLinks` of a vision process: slots in shared memory. Raises SlotError where another process writes."""
+    """`VisionLinks` of a vision process: slots in shared memory. Raises SlotError if another process writes."""
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
         self._observations = SlotWriter(directories.observation_slot(camera), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT)
@@ -100,8 +100,8 @@ class VisionSlots:
 
 
 class CameraPipeline:
-    """Driver and detector of one camera: publishes the observation of the newest frame; ``images`` records all
-    frames; ``preview`` is offered the newest. ``beat``: told at every call within how many seconds it is told again.
+    """Driver and detector of one camera: publishes the observation of the newest frame; ``images`` records all frames;
+    ``preview`` receives the newest. ``beat``: called at every call with the time limit of its next call [s].
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class CameraPipeline:
         self.frames = 0
         self.written = 0
         self.light: tuple[str, str] | None = None
-        """What the newest frame tells anew of its light: a code and a text."""
+        """New finding on the light of the newest frame: code and text."""
 
     def open(self) -> None:
         """Connect and start. Raises DriverError."""
@@ -144,8 +144,8 @@ class CameraPipeline:
             self._driver.close()
 
     def poll(self) -> bool:
-        """Process the frames that arrived; True where an observation was published. Raises DriverError: of the driver,
-        and with code ``frame`` for whatever else driver or detector raise.
+        """Process the frames that arrived; True if an observation was published. Raises DriverError: the driver's, and
+        with code ``frame`` for all other exceptions of driver or detector.
         """
         self._beat(VISION_HANG_S if self.written else CAMERA_OPENS_S)
         try:
@@ -159,7 +159,7 @@ class CameraPipeline:
                 observation = rounded(observation)
         except DriverError:
             raise
-        except Exception as error:  # of a third party's driver or detector
+        except Exception as error:  # a third party's driver or detector may raise anything
             raise DriverError("frame", f"a frame cannot be used: {cause_of(error)}", retry=True) from error
         self._links.publish_observation(observation)
         self.written += 1
@@ -187,8 +187,9 @@ class CameraPipeline:
 
 
 class Quiet:
-    """How long nobody looks for a camera's next frame: from ``QUIET_PERIODS`` of its period on longer, until a frame
-    comes after ``LOOKS`` looks in vain, and shorter at once where one may have waited. ``period_s`` 0: not at all.
+    """Adaptive pause in the polling of a camera after a frame. It starts at ``QUIET_PERIODS`` of the camera's period
+    and grows until a frame arrives after ``LOOKS`` unsuccessful polls; it is shortened at once if a frame may have
+    waited. ``period_s`` 0: no pause.
     """
 
     def __init__(self, period_s: float, poll_s: float) -> None:
@@ -197,11 +198,11 @@ class Quiet:
         self._s = self._least_s
 
     def look_in_vain(self) -> None:
-        """Count a look that found no frame."""
+        """Count a poll without a frame."""
         self._looks += 1
 
     def after_frame(self) -> float:
-        """Seconds from the look that found a frame."""
+        """Pause after a poll that returned a frame [s]."""
         if self._looks == 0:
             self._s = max(self._s - LOOKS * self._poll_s, self._least_s)
         elif self._looks > LOOKS:
@@ -224,10 +225,11 @@ def camera_loop(
     poll_s: float,
     period_s: float = 0.0,
 ) -> Generator[float]:
-    """Generator that runs a camera for ever and yields the seconds to wait before it is resumed; closing it closes
-    the camera. It is polled every ``poll_s``, and, with frames every ``period_s``, not in between (`Quiet`).
+    """Generator that runs a camera forever and yields the seconds to wait before it is resumed; closing it closes the
+    camera. It is polled every ``poll_s``, except during the pause after a frame if frames arrive every ``period_s``
+    (`Quiet`).
 
-    Every failure is reported once and answered by a reconnect after a growing pause.
+    Every failure is reported once and followed by a reconnect after a growing pause.
     """
     pause_s = FIRST_PAUSE_S
     quiet = Quiet(period_s, poll_s)
@@ -272,7 +274,7 @@ def run_camera(
     sleep: Callable[[float], None],
     between: Callable[[], None],
 ) -> None:
-    """Run a `camera_loop` until ``ended``, calling ``between`` after each of its parts; closes the camera."""
+    """Run a `camera_loop` until ``ended``, calling ``between`` after each of its steps; closes the camera."""
     with closing(loop):
         while not ended():
             pause_s = next(loop)
@@ -294,7 +296,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
     images: ImageRecorder | None = None
     preview: PreviewEncoder | None = None
     if description.delivers == "frames":
-        # OpenCV: not for cameras without pictures
+        # OpenCV: not needed for cameras without images
         from stereoservo.daemon.preview import PreviewEncoder
         from stereoservo.recording.image_recording import ImageRecorder
 
@@ -334,7 +336,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
 def main() -> int:
     """Entry of the process."""
     runtime, parent, camera = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
-    die_with_parent(parent, signal.SIGKILL)  # nothing to put in order here, and a hung driver must not survive
+    die_with_parent(parent, signal.SIGKILL)  # no cleanup is needed, and a hung driver must not survive
     termination = Termination()
     try:
         run(load_plan(runtime), camera, termination)
@@ -344,22 +346,22 @@ def main() -> int:
     return 0
 
 
-# -- light of pictures ---------------------------------------------------------------------------------------
-# Why no marker is seen: a picture that is too dark, or too bright.
+# -- light of images -----------------------------------------------------------------------------------------
+# Causes of undetected markers: an image that is too dark, or too bright.
 
 
 UNSEEN_S = 1.0
-"""Time without a marker after which the picture is looked at, and then once in each such time."""
+"""Time without a marker after which the image is examined, and then the interval of examinations [s]."""
 LEAST_CONTRAST = 30.0
-"""Grey levels between dark and bright that the shipped detectors ask of a marker."""
+"""Grey levels between dark and bright that the shipped detectors require."""
 SATURATED, MUCH_SATURATED = 254, 0.3
-"""Grey level at the sensor's limit, and the share of such pixels that hides markers."""
+"""Grey level of a saturated pixel, and the fraction of such pixels that hides markers."""
 STRIDE = 4
-"""Of rows and columns, each n-th is looked at."""
+"""Subsampling: each n-th row and column is examined."""
 
 
 def judge_light(image: ImageArray) -> tuple[str, str] | None:
-    """Code and text of what is wrong with the light of ``image`` (h, w), None where nothing is."""
+    """Code and text of a fault of the light in ``image`` (h, w), None if there is none."""
     grey = image[::STRIDE, ::STRIDE]
     dark, bright = (float(level) for level in np.percentile(grey, [1.0, 99.5]))
     cut = float((grey >= SATURATED).mean())
@@ -377,15 +379,16 @@ def judge_light(image: ImageArray) -> tuple[str, str] | None:
 
 
 class LightWatch:
-    """Tells once when a camera sees no marker because of its light, and once when it sees one again."""
+    """Reports once when a camera sees no marker because of its light, and once when it sees one again."""
 
     def __init__(self) -> None:
         self._last_ns: int | None = None
         self._code = ""
 
     def see(self, image: ImageArray, markers: int, t_ns: int) -> tuple[str, str] | None:
-        """Code and text of what is new with a picture of ``t_ns`` that shows so many ``markers``: ``camera_dark``,
-        ``camera_glare``, ``camera_light``; else None."""
+        """Code and text of a change of the light, given an image taken at ``t_ns`` with ``markers`` detected markers:
+        ``camera_dark``, ``camera_glare``, ``camera_light``; else None.
+        """
         if self._last_ns is None or markers:
             self._last_ns = t_ns
         if markers:

@@ -18,9 +18,9 @@ class FramedModel:
     """A model's parts in a frame of its stratum (projective, affine or Euclidean).
 
     Metric: Euclidean up to scale, the left camera ``K [I | 0]``. Affine: infinity is (0, 0, 0, 1). Projective: any.
-    ``generators`` (n, 4, 4) as motions of the markers at the zero, base first, with the sense of an arm that
-    carries the markers (those of an eye-in-hand model are turned round); ``zero`` (n,); ``cameras`` (c, 3, 4) to
-    ideal pixels; ``lenses`` (c, 4); ``points`` (m, 4), height 1.
+    ``generators`` (n, 4, 4): motions of the markers at the zero, base first, with the signs of an arm that carries the
+    markers (those of an eye-in-hand model are negated); ``zero`` (n,); ``cameras`` (c, 3, 4) to ideal pixels;
+    ``lenses`` (c, 4); ``points`` (m, 4), height 1.
     """
 
     kinds: tuple[str, ...]
@@ -56,9 +56,9 @@ def stratum_frame(stratum: Stratum, plane: FloatArray, to_euclidean: FloatArray 
 
 @dataclass(frozen=True, eq=False)
 class Axes:
-    """Axes at the zero of a rigid mechanism: unit ``directions`` (n, 3) in the positive sense, ``points`` (n, 3).
+    """Axes of a rigid mechanism at the zero: unit ``directions`` (n, 3) of positive motion, ``points`` (n, 3).
 
-    Prismatic joints have a direction only: their points are NaN. ``scales`` (n,): lengths of the frame for one
+    Prismatic joints have a direction only: their points are NaN. ``scales`` (n,): length in units of the frame for one
     unit of a prismatic joint; NaN for revolute ones.
     """
 

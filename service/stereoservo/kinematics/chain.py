@@ -31,12 +31,11 @@ class ChainError(ValueError):
 class ProjectiveChain:
     """``H(q) = exp((q₁−z₁)Ĥ₁)…exp((qₙ−zₙ)Ĥₙ)``, base first (5.18).
 
-    ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the
-    zero. ``zero`` (n,): the configuration at which H is the identity. ``tip_first``: cameras ride on the tip and
-    the markers are static (eye-in-hand), so that the joint next to them, the base's, acts first:
-    ``H(q) = exp((qₙ−zₙ)Ĥₙ)…exp((q₁−z₁)Ĥ₁)``, joints still counted from the base, signs inside the generators.
-    Raises ChainError on shapes or kinds
-    that do not fit.
+    ``kinds``: ``"revolute"`` [rad] or ``"prismatic"`` [m] for each joint. ``generators`` (n, 4, 4) at the zero.
+    ``zero`` (n,): the configuration at which H is the identity. ``tip_first``: eye-in-hand (the cameras are mounted on
+    the tip, the markers are static). The base joint then acts on the markers first:
+    ``H(q) = exp((qₙ−zₙ)Ĥₙ)…exp((q₁−z₁)Ĥ₁)``; joints are still counted from the base, and the signs are part of the
+    generators. Raises ChainError for wrong shapes or kinds.
     """
 
     kinds: tuple[str, ...]
@@ -75,7 +74,7 @@ class ProjectiveChain:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """Joints in the order of the product's factors, the one farthest from the markers first."""
+        """Joint indices in the order of the product's factors: the joint farthest from the markers first."""
         joints = range(self.joints)
         return tuple(reversed(joints)) if self.tip_first else tuple(joints)
 
@@ -103,7 +102,7 @@ class ProjectiveChain:
         return product
 
     def operators_at(self, q: FloatArray) -> FloatArray:
-        """Generators at the present configuration, ``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4) (5.21)."""
+        """Generators at the configuration ``q`` (n,), ``Ĥ_j|_Q = H̄_{j−1} Ĥ_j H̄_{j−1}⁻¹`` (n, 4, 4) (5.21)."""
         order = list(self.order)
         partial = self.partial_displacements(q)[:-1]
         operators = np.empty_like(self.generators)
@@ -111,14 +110,12 @@ class ProjectiveChain:
         return operators
 
     def point_jacobian(self, q: FloatArray, M_now: FloatArray) -> FloatArray:
-        """``∂M/∂q_j = Ĥ_j|_Q M`` (m, 4, n) of points ``(m, 4)`` as they are at ``q`` (5.47)."""
+        """``∂M/∂q_j = Ĥ_j|_Q M`` (m, 4, n) of points ``(m, 4)``, given at ``q`` (5.47)."""
         jacobian: FloatArray = np.einsum("jik,mk->mij", self.operators_at(q), M_now)
         return jacobian
 
     def image_jacobian(self, Ps: FloatArray, q: FloatArray, M_now: FloatArray) -> FloatArray:
-        """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3,
-        4)`` (8.33).
-        """
+        """``J_G P J_H`` (c, m, 2, n) [px/rad or px/m] of points ``(m, 4)`` at ``q`` in cameras ``(c, 3, 4)`` (8.33)."""
         J_H = self.point_jacobian(q, M_now)
         jacobian: FloatArray = np.einsum("cmik,mkj->cmij", projection_jacobian_many(Ps, M_now), J_H)
         return jacobian

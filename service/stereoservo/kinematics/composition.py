@@ -1,9 +1,9 @@
-"""Composition of joint displacements, in numpy and as kernels: the effect of a small motion of all joints on points
-and on the joint operators; and a basis of the rigid motions of points.
+"""Composition of joint displacements, in numpy and as kernels: the effect of a small motion of all joints on points and
+on the joint operators; and a basis of the rigid motions of points.
 
-An arm re-zeroed at its present configuration (Theorem 10) needs no more than its operators there: ``H(q+Δq)
-H(q)⁻¹`` is their product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the
-loop runs the kernels ``displace`` and ``move_operators``.
+An arm re-zeroed at its current configuration (Theorem 10) is described by its operators there: ``H(q+Δq) H(q)⁻¹`` is
+their product of exponentials. ``displacement`` and ``moved_operators`` are the readable references; the loop runs the
+kernels ``displace`` and ``move_operators``.
 """
 
 from __future__ import annotations
@@ -23,17 +23,15 @@ class Composition(IntEnum):
     """The order in which the joints of an arm act on the markers."""
 
     BASE_FIRST = 0
-    """Product of exponentials, the base's joint leftmost (5.18): cameras are static."""
+    """Product of exponentials, base joint leftmost (5.18): cameras are static."""
     TIP_FIRST = 1
-    """The tip's joint leftmost: cameras ride on the tip."""
+    """Tip joint leftmost: cameras are mounted on the tip."""
     SIMULTANEOUS = 2
-    """All joints act at once, ``exp(Σ Δq_j Ĥ_j)``, with operators that stay: an arm commanded by Cartesian twists."""
+    """All joints act at once, ``exp(Σ Δq_j Ĥ_j)``, with constant operators: an arm commanded by Cartesian twists."""
 
 
 class PresentArm(NamedTuple):
-    """An arm where it is: its ``operators`` (n, 4, 4) at the present joints (5.21), and their ``composition``, a
-    `Composition`.
-    """
+    """An arm at its current configuration: its ``operators`` (n, 4, 4) there (5.21), and their `Composition`."""
 
     operators: FloatArray
     composition: int
@@ -110,8 +108,8 @@ def move_operators(operators: FloatArray, composition: int, step: FloatArray) ->
 
 def displacement_basis(projective_to_euclidean: FloatArray, points: FloatArray) -> FloatArray:
     """Twists (6, 4, 4): translations along three axes, then rotations about them through the centroid of ``points``
-    (m, 4). A unit of translation is the largest distance of a point from the centroid, so that all six are of
-    similar size.
+    (m, 4). The unit of translation is the largest distance of a point from the centroid, so all six are of similar
+    size.
     """
     H = np.asarray(projective_to_euclidean, dtype=np.float64)
     euclidean = points @ H.T

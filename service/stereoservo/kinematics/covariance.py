@@ -1,10 +1,11 @@
 """Propagation of a model's covariance to quantities that do not depend on its projective frame, such as axis angles,
-intrinsics or predicted pixels: covariances and standard deviations. Those of predicted pixels contain the errors of the
+intrinsics or predicted pixels: covariances and standard deviations. Those of predicted pixels include the errors of the
 joint readings.
 
 A quantity is a function of the model: an angle between axes, an intrinsic parameter through
-``projective_to_euclidean``, a predicted pixel. Its derivative is taken along the principal axes of the covariance, a
-small part of a standard deviation to either side, so that it needs no formula and no step size of its own.
+``projective_to_euclidean``, a predicted pixel. Its derivative is a central difference along each principal axis of the
+covariance, with a step of a small fraction of the standard deviation; no formula and no step size are needed for each
+quantity.
 """
 
 from __future__ import annotations
@@ -21,22 +22,22 @@ from stereoservo.kinematics.parameterization import conjugation
 from stereoservo.numerics.arrays import FloatArray
 
 STEP = 0.01
-"""Standard deviations to either side over which derivatives are taken."""
+"""Step of central differences [standard deviations]."""
 
 
 JOINT_STEP = 1e-5
-"""Change of a joint's position [rad or m] to either side over which derivatives by it are taken."""
+"""Step of central differences with respect to a joint's position [rad or m]."""
 
 
 class NoCovarianceError(ValueError):
-    """The model carries no covariance: it was written before, or not by a fit."""
+    """The model contains no covariance: its file is of an older version, or it is not the result of a fit."""
 
 
 def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
     """The model with its parameters (p,) changed by ``x`` along the directions of its covariance.
 
-    Generators are conjugated, so that they keep their algebra; points are scaled back to height 1 over the plane
-    at infinity. Neither statistics nor covariance are carried. Raises NoCovarianceError, ValueError.
+    Generators are conjugated, which keeps their algebra; points are rescaled to height 1 over the plane at infinity.
+    The result has neither statistics nor covariance. Raises NoCovarianceError, ValueError.
     """
     given = _covariance_of(model)
     x = np.asarray(x, dtype=np.float64)
@@ -77,7 +78,7 @@ def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
 def propagated(model: CellModel, function: Callable[[CellModel], FloatArray]) -> tuple[FloatArray, FloatArray]:
     """Values (r,) of ``function`` at the model and their covariance (r, r), to first order.
 
-    ``function`` must not depend on the frame, nor, in the metric stratum, on the one open length. Raises
+    ``function`` must not depend on the frame, nor, in the metric stratum, on the undetermined scale. Raises
     NoCovarianceError.
     """
     root = covariance_axes(model)
@@ -91,14 +92,14 @@ def propagated(model: CellModel, function: Callable[[CellModel], FloatArray]) ->
 
 
 def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatArray]) -> FloatArray | None:
-    """Standard deviations (r,) of the values of ``function``; None where the model carries no covariance."""
+    """Standard deviations (r,) of the values of ``function``; None if the model contains no covariance."""
     if model.covariance is None:
         return None
     return np.asarray(np.sqrt(np.diag(propagated(model, function)[1])))
 
 
 def predicted_pixels(model: CellModel, positions: FloatArray) -> FloatArray:
-    """Raw pixels (c, s, m, 2) of the markers at joint ``positions`` (s, n), inside the image or not."""
+    """Raw pixels (c, s, m, 2) of the markers at joint ``positions`` (s, n); they may lie outside the image."""
     chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, tip_first=model.tip_first)
     points = model.marker_points @ chain.displacements(positions).transpose(0, 2, 1)
     pixels = []
@@ -110,9 +111,10 @@ def predicted_pixels(model: CellModel, positions: FloatArray) -> FloatArray:
 
 def pixel_covariances(model: CellModel, positions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Predicted raw pixels (c, s, m, 2) at reported joint ``positions`` (s, n), and their covariances (c, s, m, 2, 2)
-    [px²] about what is there: of the model's parameters, and of the joint readings, ``J Cov Jᵀ + J_q S_q J_qᵀ``.
+    [px²] with respect to the true pixels: ``J Cov Jᵀ + J_q S_q J_qᵀ``, from the errors of the model's parameters and of
+    the joint readings.
 
-    To first order; without the noise of a measurement. Raises NoCovarianceError.
+    First order; measurement noise is not included. Raises NoCovarianceError.
     """
     positions = np.asarray(positions, dtype=np.float64)
     slopes = [
@@ -135,8 +137,8 @@ def pixel_covariances(model: CellModel, positions: FloatArray) -> tuple[FloatArr
 
 
 def covariance_axes(model: CellModel) -> FloatArray:
-    """Root ``L`` (p, r) of the covariance, ``L Lᵀ``: its principal axes as correlations, each scaled to one
-    deviation.
+    """Root ``L`` (p, r) of the covariance ``L Lᵀ``: the principal axes of the correlation matrix, each scaled to one
+    standard deviation.
 
     Raises NoCovarianceError.
     """

@@ -1,24 +1,24 @@
 """Denavit-Hartenberg parameters of a calibrated metric model with standard deviations, scaled by one known length
 (thesis 5.1, 5.2, 5.5.2).
 
-Row j, base first, is what joint j does and the link behind it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with ``θ = q +
-theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j precedes joint j: its r_j,
-α_j and l_j (r is the length, l the offset; the text under it has them exchanged) are a, α and d of row j-1 here.
+Row j, base first, is the motion of joint j and the link after it: ``Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β)``, with
+``θ = q + theta`` for a revolute and ``d = scale q + d`` for a prismatic joint. In (5.1) link j precedes joint j: its
+r_j, α_j and l_j (r is the length, l the offset; the text under it has them exchanged) are a, α and d of row j-1 here.
 
-Conventions, where the classical ones leave a choice or fail:
+Conventions where the classical ones are ambiguous or fail:
 
 - skew axes: x is the common normal, from axis j to axis j+1, so that ``a > 0`` and α lies in (-180°, 180°];
-- axes that (nearly) meet, by less than ``MEETING`` of the arm's size: x is along ``z_j x z_j+1``, so that α lies in
+- axes that (nearly) intersect, within ``MEETING`` of the arm's size: x is along ``z_j x z_j+1``, so that α lies in
   (0°, 180°) and the small a may have either sign;
 - axes (nearly) parallel, by less than ``PARALLEL``: the common normal is undefined or ill-conditioned, so d is 0 and
-  a small second angle β takes its place (Hayati): x goes from the end of the row before, square to axis j, to axis
+  a small second angle β takes its place (Hayati): x goes from the end of the previous row, normal to axis j, to axis
   j+1;
-- prismatic joints have no place: their axis is led through the end of the row before (``a = 0``), and through the
-  first revolute axis where they begin the chain; where it is parallel to its neighbour, x stays as it was;
-- the base's frame is free: theta and d of row 1 are 0, and so is the d with which the first axis of another direction
-  leaves those parallel to the first. What is behind the last axis is the tool's: that row is 0.
+- prismatic joints have no position: their axis passes through the end of the previous row (``a = 0``), and through the
+  first revolute axis if they begin the chain; if it is parallel to the adjacent axis, x is unchanged;
+- the base frame is free: theta and d of row 1 are 0, and so is the d at which the first axis of another direction
+  leaves those parallel to the first. The part after the last axis belongs to the tool: that row is 0.
 
-``chosen`` names the entries that such a choice sets, without a measurement.
+``chosen`` lists the entries that are set by a convention and not measured.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ LinkKind = Literal["skew", "meeting", "parallel", "to_prismatic", "last"]
 PARALLEL = np.radians(5.0)
 """Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
-"""Distance between axes, as a share of the arm's size, below which they count as meeting."""
+"""Distance between axes, as a fraction of the arm's size, below which they count as intersecting."""
 DH_HEAD = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
 ROUNDING = 1e-9
-"""Deviations of so small a share of their value are those of the known length itself: rounding."""
+"""Standard deviations below this fraction of the value are rounding: the value is the known length itself."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
 
 
@@ -74,12 +74,11 @@ class ReadOutError(ValueError):
 
 
 class DhRow(msgspec.Struct, frozen=True):
-    """Denavit-Hartenberg parameters of one link: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with
-    its standard deviation.
+    """Denavit-Hartenberg parameters of one link: ``a``, ``d`` [m], ``alpha``, ``beta``, ``theta`` [rad], each with its
+    standard deviation.
 
-    ``theta`` (revolute) and ``d`` (prismatic) are the offsets at joint position 0; ``scale``: metres for one unit
-    of a prismatic joint. A standard deviation is None where the model carries no covariance, 0 for entries in
-    ``chosen``.
+    ``theta`` (revolute) and ``d`` (prismatic) are the offsets at joint position 0; ``scale``: metres for one unit of a
+    prismatic joint. A standard deviation is None if the model contains no covariance, 0 for entries in ``chosen``.
     """
 
     joint: str
@@ -152,12 +151,12 @@ def _with_deviation(value: float, std: float | None) -> str:
 
 
 def decimals(std: float) -> int:
-    """Decimals that are significant for a standard deviation."""
+    """Number of significant decimals for a standard deviation."""
     return max(0, 1 - math.floor(math.log10(std)))
 
 
 def metres_per_length(model: CellModel, known: KnownLength) -> float:
-    """Metres for one length of the Euclidean frame of a metric ``model``, by the ``known`` length.
+    """Scale of the Euclidean frame of a metric ``model`` [m per unit length], from the ``known`` length.
 
     Raises ReadOutError as `denavit_hartenberg`.
     """
@@ -302,7 +301,7 @@ def conventions(parts: FramedModel) -> tuple[Convention, ...]:
     axes = axes_at_origin(parts)
     plain = tuple(Convention(_link_kind(axes, j)) for j in range(len(axes.kinds)))
     table = dh_table(axes, plain)
-    # An arm whose axes all meet has no size of its own: then that of the body that it carries.
+    # An arm whose axes all intersect has no size: the size of the carried body is used.
     body = float(np.linalg.norm(np.ptp(parts.points[:, :3], axis=0)))
     size = max(body, float(np.abs(table[:, [0, 3]]).max()))
     result = []
@@ -330,13 +329,13 @@ def _parallel(u: FloatArray, v: FloatArray) -> bool:
 
 
 def axes_at_origin(parts: FramedModel) -> Axes:
-    """The axes with all joints at position 0, wherever the model has its zero (5.21)."""
+    """The axes with all joints at position 0, whatever the model's zero (5.21)."""
     chain = ProjectiveChain(parts.kinds, parts.generators, parts.zero)
     return joint_axes(parts.kinds, chain.operators_at(np.zeros(len(parts.kinds))))
 
 
 def dh_table(axes: Axes, links: tuple[Convention, ...]) -> FloatArray:
-    """Rows (n, 5) ``a, α, β, d, θ`` in the lengths of the frame, of `axes_at_origin`."""
+    """Rows (n, 5) ``a, α, β, d, θ`` in units of the frame, of `axes_at_origin`."""
     n = len(axes.kinds)
     table = np.zeros((n, 5))
     origin = base_origin(axes)
@@ -362,7 +361,7 @@ def _link(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Foot point (3,) of link j on its axis, its x (3,), and ``a, α, β`` (3,).
 
-    ``start``, ``before`` (3,): the end of the row before and its x.
+    ``start``, ``before`` (3,): the end of the previous row and its x.
     """
     z = axes.directions[j]
     if convention.link == "last":
@@ -373,10 +372,10 @@ def _link(
             return start, before, np.array([0.0, *_two_angles(z, before, z_next)])
         return start, unit(np.cross(z, z_next)), np.array([0.0, axis_angle(z, z_next), 0.0])
     if convention.link == "parallel":
-        # Where the next axis meets the plane through the start square to this one.
+        # Intersection of the next axis with the plane through the start, normal to this axis.
         arm = c_next + z_next * ((start - c_next) @ z / (z_next @ z)) - start
         length = float(np.linalg.norm(arm))
-        # A slide led through the axis that it carries: nothing to point at.
+        # A prismatic axis that passes through the axis it carries: x has no direction.
         along = unit(arm) if length > 1e-9 * float(np.linalg.norm(start) + 1.0) else before
         return start, along, np.array([length, *_two_angles(z, along, z_next)])
     own = start if axes.kinds[j] == "prismatic" else axes.points[j]
@@ -395,7 +394,7 @@ def _two_angles(z: FloatArray, x: FloatArray, z_next: FloatArray) -> tuple[float
 
 
 def _square_to(z: FloatArray, x: FloatArray | None) -> FloatArray:
-    """Projection of ``x`` normal to ``z``, or any normal where there is none."""
+    """Unit projection of ``x`` normal to ``z``, or any normal of ``z`` if there is none."""
     if x is None or np.linalg.norm(np.cross(z, x)) < 1e-3:
         x = np.eye(3)[int(np.argmin(np.abs(z)))]
     return unit(x - z * (x @ z))
@@ -404,7 +403,7 @@ def _square_to(z: FloatArray, x: FloatArray | None) -> FloatArray:
 def base_leaves(axes: Axes) -> tuple[int, int]:
     """Indices of the first revolute joint, and of the last one parallel to it before an axis of another direction.
 
-    Both are the number of joints where there is no such joint.
+    Both are the number of joints if there is no such joint.
     """
     n = len(axes.kinds)
     placed = [j for j, kind in enumerate(axes.kinds) if kind == "revolute"]
@@ -417,9 +416,10 @@ def base_leaves(axes: Axes) -> tuple[int, int]:
 
 
 def base_origin(axes: Axes) -> FloatArray:
-    """Origin (3,) of the base, a free choice: such that no row contains an arbitrary length.
+    """Origin (3,) of the base, chosen so that no row contains an arbitrary length.
 
-    On the first revolute axis, at the height at which the first axis of another direction leaves those parallel to it.
+    It lies on the first revolute axis, at the height at which the first axis of another direction leaves those parallel
+    to it.
     """
     first, last = base_leaves(axes)
     if first == len(axes.kinds):

@@ -1,10 +1,9 @@
 """List of a model's gauge-invariant quantities (independent of frame and scale), named and with standard deviations,
 and of those that its stratum does not determine, with the reason.
 
-What a stratum does not determine is listed, too, with the reason. In every stratum: where a marker is seen at the
-zero, how each joint moves it in each image, and where the axes are seen. Affine: coordinates in units of prismatic
-joints, ratios of distances between parallel axes. Metric: angles between axes, intrinsics, vergence, all ratios
-of lengths.
+In every stratum: the image of a marker at the zero, its motion by each joint in each image, and the images of the axes.
+Affine: coordinates in units of prismatic joints, ratios of distances between parallel axes. Metric: angles between
+axes, intrinsics, vergence, all ratios of lengths.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ from stereoservo.numerics.arrays import FloatArray
 
 
 class Quantity(msgspec.Struct, frozen=True):
-    """A named quantity. ``std`` is None where the model carries no covariance.
+    """A named quantity. ``std`` is None if the model contains no covariance.
 
-    ``value`` is None where the model does not determine it; ``reason`` then holds the cause.
+    ``value`` is None if the model does not determine it; ``reason`` then holds the cause.
     """
 
     name: str
@@ -45,7 +44,7 @@ class Quantity(msgspec.Struct, frozen=True):
 
 
 def gauge_free_quantities(model: CellModel) -> list[Quantity]:
-    """All quantities of ``model`` that its stratum determines, then what it does not, with the reason."""
+    """All quantities of ``model`` that its stratum determines, then those that it does not, with the reason."""
     groups = _groups(model)
 
     def read(candidate: CellModel) -> FloatArray:
@@ -113,7 +112,7 @@ def _groups(model: CellModel) -> list[Group]:
 Values = Callable[[FramedModel], FloatArray]
 
 FARTHEST_LINE = 1e6
-"""Distance from the image's middle [image widths] up to which the image of an axis is listed."""
+"""Distance from the image centre [image widths] up to which the image of an axis is listed."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ class Group:
 
 
 def sights(model: CellModel, parts: FramedModel) -> Group:
-    """Quantities of the markers' images: raw pixels of the central marker at the zero, and how each joint moves it
+    """Quantities of the markers' images: raw pixels of the central marker at the zero, its motion by each joint
     (5.38).
     """
     marker = _middle_marker(parts)
@@ -153,8 +152,8 @@ def sights(model: CellModel, parts: FramedModel) -> Group:
 
 
 def sense_of(model: CellModel) -> float:
-    """Sign of joint motion: -1 where the joints carry the cameras, since `framed` gives generators as of an arm
-    that carries the markers.
+    """Sign of joint motion: -1 if the joints carry the cameras, because `framed` returns generators with the signs of
+    an arm that carries the markers.
     """
     return -1.0 if model.tip_first else 1.0
 
@@ -187,7 +186,7 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
                 along = np.array([line[1], -line[0]])
                 sense = np.sign(along @ (np.cos(angle), np.sin(angle))) / np.linalg.norm(along)
                 u, v = sense * along
-                # About the present angle, so that none jumps by half a turn.
+                # Relative to the current angle, so that none jumps by half a turn.
                 turn = np.arctan2(np.cos(angle) * v - np.sin(angle) * u, np.cos(angle) * u + np.sin(angle) * v)
                 return np.array([np.degrees(angle + turn), sense * (line @ middle)])
 
@@ -197,7 +196,7 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
 
 
 def lenses(model: CellModel) -> list[Group]:
-    """Quantities of lens distortion, where the model has any."""
+    """Quantities of lens distortion, if the model has any."""
     groups = []
     for c, camera in enumerate(model.cameras):
         if not bends(camera.lens):
@@ -222,12 +221,13 @@ def _image_line(parts: FramedModel, j: int, c: int) -> FloatArray:
 
 
 INDEPENDENT = 1e-3
-"""Least over largest singular value of prismatic directions, at unit length, that span space."""
+"""Smallest over largest singular value of prismatic unit directions from which on they span space."""
 PARALLEL = 1e-2
 """Sine of the angle [affine frame] up to which axes of an affine model count as parallel."""
 
 LEAST = 0.1
-"""Smallest length of the arm, as a share of the cell's largest, that may be the unit of ratios: noise must not be."""
+"""Smallest length of the arm, as a fraction of the cell's largest, that may be the unit of ratios: noise must not be.
+"""
 
 
 def affine_quantities(model: CellModel, parts: FramedModel) -> list[Group]:
@@ -241,7 +241,7 @@ def affine_quantities(model: CellModel, parts: FramedModel) -> list[Group]:
 
 
 def _spanning(parts: FramedModel, slides: list[int]) -> list[int]:
-    """First three prismatic joints whose directions span space, or none."""
+    """The first three prismatic joints whose directions span space, or an empty list."""
     steps = parts.generators[slides, :3, 3]
     steps = steps / np.linalg.norm(steps, axis=1)[:, None]
     chosen: list[int] = []
@@ -256,7 +256,7 @@ def _spanning(parts: FramedModel, slides: list[int]) -> list[int]:
 
 
 def _coordinates(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Group]:
-    """Quantities: from the first marker to each other one, in units of three prismatic joints that span space."""
+    """Quantities: vectors from the first marker to each other one, in units of three spanning prismatic joints."""
     basis = _spanning(parts, slides)
     if not basis or len(parts.points) < 2:
         return []
@@ -309,9 +309,7 @@ def _turning_plane(G: FloatArray) -> FloatArray:
 
 
 def _parallel_axes(model: CellModel, parts: FramedModel) -> list[Group]:
-    """Quantities of three successive parallel revolute axes: ratio of their distances, and the angle at the middle
-    one.
-    """
+    """Quantities of three successive parallel revolute axes: ratio of distances, and the angle at the middle one."""
     turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
     groups = []
     for three in zip(turns, turns[1:], turns[2:], strict=False):
@@ -349,7 +347,7 @@ def _fixed_point(G: FloatArray) -> FloatArray:
 def _plane_arm(G: FloatArray, other: FloatArray) -> FloatArray:
     """Vector (2,) from the axis of ``G`` to that of ``other``, in an orthonormal frame of the plane of rotation.
 
-    ``A³ = -A``: ``-A²`` projects along the axis, and ``e``, ``A e`` are square to each other and of one length.
+    ``A³ = -A``: ``-A²`` projects along the axis, and ``e``, ``A e`` are orthogonal and of equal length.
     """
     A = G[:3, :3]
     plane = -(A @ A)
@@ -388,8 +386,8 @@ def _vergence(model: CellModel, c: int) -> Group:
 
 
 def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]:
-    """Quantities: angles of successive axes; of nearly parallel revolute ones the two small signed angles of
-    Hayati.
+    """Quantities: angles between successive axes; for nearly parallel revolute axes Hayati's two small signed
+    angles.
     """
     two = [link.link == "parallel" and kind == "revolute" for link, kind in zip(links, model.joint_kinds, strict=True)]
     names: list[tuple[str, str]] = []
@@ -410,13 +408,13 @@ def _axis_angles(model: CellModel, links: tuple[Convention, ...]) -> list[Group]
 
 
 def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]) -> Group:
-    """Quantities: common normals, offsets along axes, baselines, marker distances, prismatic units, over the arm's
-    largest length.
+    """Quantities: common normals, offsets along axes, baselines, marker distances, prismatic units, divided by the
+    arm's largest length.
     """
     named = _named_lengths(model, parts, links)
     measured = _measured_lengths(parts, links)
     usable = [k for k, (_, arm) in enumerate(named) if arm and abs(measured[k]) > LEAST * np.abs(measured).max()]
-    if not usable:  # axes that all meet: the first baseline, or the first distance of markers
+    if not usable:  # all axes intersect: the first baseline, or the first distance of markers
         usable = [next(k for k, (name, arm) in enumerate(named) if name.startswith(("baseline", "distance")))]
     largest = max(usable, key=lambda k: abs(measured[k]))
     unit = named[largest][0]
@@ -430,7 +428,7 @@ def _lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]
 
 
 def _named_lengths(model: CellModel, parts: FramedModel, links: tuple[Convention, ...]) -> list[tuple[str, bool]]:
-    """Name of each measured length and whether it is the arm's; an empty name where a convention sets it."""
+    """Name of each measured length and whether it belongs to the arm; the name is empty if a convention sets it."""
     chosen_of = chosen_columns(axes_at_origin(parts), links)
     names: list[tuple[str, bool]] = []
     for j, joint in enumerate(model.joint_names):

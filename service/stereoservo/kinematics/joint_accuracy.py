@@ -1,4 +1,4 @@
-"""Errors of joint readings that a model states: random, repeatable, and by posture."""
+"""Errors of the joint readings, as part of a model: random, repeatable, and dependent on posture."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 POSTURE_LENGTH = 1.0
-"""Distance of postures [rad, m] over which errors by posture change their course."""
+"""Correlation length of posture-dependent errors in joint space [rad, m]."""
 
 
 class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
-    """Standard deviations (n,) of the errors of joint readings, true minus reported [rad or m], as the trials show
-    them.
+    """Standard deviations (n,) of the errors of joint readings, true minus reported [rad or m], as estimated from the
+    trials.
 
-    ``random``: changes from stop to stop. ``repeatable``: the same whenever the joint reads the same (gear ripple, play
-    driven from one side). ``stated``: of both together at a reading that the trials have not seen, larger than their
-    root sum of squares by what the estimates leave open. ``posture``: of what changes slowly with the posture of the
-    whole arm (sag, coupled joints), far from that of the model's zero; see `posture_deviations`.
+    ``random``: changes from stop to stop. ``repeatable``: the same at equal readings of the joint (gear ripple, play
+    driven from one side). ``stated``: both together at a reading that is not in the trials; larger than their root sum
+    of squares by the uncertainty of the estimates. ``posture``: errors that change slowly with the posture of the whole
+    arm (sag, coupled joints), far from the posture at the model's zero; see `posture_deviations`.
     """
 
     random: FloatArray
@@ -27,18 +27,18 @@ class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
     posture: FloatArray
 
     def in_order(self, order: IntArray) -> JointAccuracy:
-        """The same of joints in another order (n,)."""
+        """The same errors with the joints in another order (n,)."""
         return JointAccuracy(self.random[order], self.repeatable[order], self.stated[order], self.posture[order])
 
     def deviations(self, offsets: FloatArray) -> FloatArray:
-        """Deviations (s, n) of the readings at positions ``offsets`` (s, n) from the model's zero."""
+        """Standard deviations (s, n) of the readings at positions ``offsets`` (s, n) from the model's zero."""
         alike = posture_correlation(offsets, np.zeros((1, offsets.shape[1])))
         return np.asarray(np.sqrt(self.stated**2 + self.posture**2 * (1.0 - alike**2)))
 
 
 def posture_correlation(one: FloatArray, other: FloatArray) -> FloatArray:
-    """Correlation (s, t) of errors by posture at positions (s, n) and (t, n): squared exponential (Rasmussen, Williams,
-    2006, 4.2).
+    """Correlation (s, t) of posture-dependent errors at positions (s, n) and (t, n): squared exponential (Rasmussen,
+    Williams, 2006, 4.2).
     """
     squares = ((one[:, None] - other[None]) ** 2).sum(axis=2)
     return np.asarray(np.exp(-0.5 * squares / POSTURE_LENGTH**2))

@@ -1,8 +1,8 @@
 """Joint angles estimated from images of known points without an initial guess: all configurations that fit, homing
 displacements, and encoder zeros, with covariances (thesis 4.5.4, (4.45)).
 
-No initial guess is asked for: the search starts all over joint space, and every configuration that the pixels
-leave possible is told. Angles of revolute joints are modulo 2π, nearest the centre of their limits.
+The search starts from points distributed over the joint space and returns every configuration that is consistent with
+the pixels. Angles of revolute joints are modulo 2π, nearest to the centre of their limits.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 STARTS = 512
-"""Starts of a global search; up to ``GRID`` a joint where that is fewer."""
+"""Number of starts of a global search; ``GRID`` per joint if that is fewer."""
 GRID = 16
 RAY_STEPS = 25
-"""Steps by rays, before those by pixels."""
+"""Number of steps with ray residuals, before those with pixel residuals."""
 PIXEL_STEPS = 60
 VALLEY_STEPS = 400
-"""Further steps for the ends that the pixels leave possible."""
+"""Number of further steps for the end points that are consistent with the pixels."""
 SETTLED = 1e-12
-"""Relative change of the cost, or step [rad or m], at which a descent has come to its end."""
+"""Relative change of the cost, or step [rad or m], at which a descent has converged."""
 LONGEST_STEP = 0.5
 """Largest change of a joint in one step [rad or m]."""
 AMBIGUOUS = 25.0
-"""Chi-square by which another configuration may fit worse and still count as possible."""
+"""Increase of chi-square up to which another configuration counts as possible."""
 MAX_SIGMA_FACTOR = 3.0
-"""Residual [stated sigmas, rms] above which the pixels are not those of this chain and these points."""
+"""Residual [stated sigmas, rms] above which the pixels do not belong to this chain and these points."""
 EXACT = 1e-4
 """Cost at which equations without redundancy count as solved."""
 MISFIT_TAIL = 1e-6
-"""Probability below which a cost is not put down to chance."""
+"""Probability below which a cost is not explained by noise."""
 LARGEST_DEVIATION = 0.1
 """Standard deviation [rad or m] above which a joint counts as not observable."""
 
@@ -58,7 +58,8 @@ Linearise = Callable[[FloatArray], tuple[FloatArray, FloatArray, BoolArray]]
 class JointAngles:
     """Joints ``q`` (n,) [rad or m] of least reprojection error, with ``covariance`` (n, n) at the stated noise.
 
-    ``cost``: sum of squares over the stated variances, with ``freedom`` measurements less joints.
+    ``cost``: sum of squared residuals divided by the stated variances; ``freedom``: number of measurements minus number
+    of joints.
     """
 
     q: FloatArray
@@ -79,12 +80,12 @@ def measured_joints(
     start: FloatArray | None = None,
     largest_deviation: float = LARGEST_DEVIATION,
 ) -> tuple[JointAngles, ...]:
-    """All configurations that the pixels of ``problem`` admit, the best first.
+    """All configurations that are consistent with the pixels of ``problem``, the best first.
 
-    ``limits`` (n, 2) [rad or m] confine the search; without them revolute joints may be anywhere, prismatic ones
-    need theirs. ``start`` (n,) looks only near a configuration. Raises JointAnglesError: ``limits``, ``too_few``
-    (fewer coordinates than joints), ``no_agreement`` (no configuration explains the pixels), ``outside_limits``,
-    ``not_observable`` with the joints whose deviation exceeds ``largest_deviation`` [rad or m].
+    ``limits`` (n, 2) [rad or m] bound the search; without them revolute joints are unbounded, prismatic joints require
+    limits. With ``start`` (n,) only the configuration near it is searched. Raises JointAnglesError: ``limits``,
+    ``too_few`` (fewer coordinates than joints), ``no_agreement`` (no configuration explains the pixels),
+    ``outside_limits``, ``not_observable`` with the joints whose deviation exceeds ``largest_deviation`` [rad or m].
     """
     seen = problem.seen
     n = seen.chain.joints
@@ -100,7 +101,7 @@ def measured_joints(
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
     _refuse_open(problem, q[ordered[0]], largest_deviation)
-    # Few are left: those that crept along a valley go on to its bottom, where they are one configuration.
+    # Few are left: those in a narrow valley are refined to its minimum, where they are one configuration.
     ends, costs, _ = _descent(problem.linearise, q[ordered], VALLEY_STEPS)
     ordered = np.argsort(costs, kind="stable")
     found = _distinct_configurations(problem, _wrapped(ends, bounds, seen)[ordered], costs[ordered])
@@ -113,10 +114,11 @@ def measured_joints(
 def refined_joints(
     problem: JointProblem, starts: FloatArray, *, limits: FloatArray | None = None
 ) -> tuple[JointAngles | JointAnglesError, ...]:
-    """For each of ``starts`` (s, n) the configuration near it that fits the pixels of ``problem`` best, or why there is
-    none: ``no_agreement``, ``outside_limits``; all of them descended at once.
+    """For each of ``starts`` (s, n) the configuration near it that fits the pixels of ``problem`` best, or the error:
+    ``no_agreement``, ``outside_limits``. All starts are refined together.
 
-    Joints that the pixels do not tell have a large deviation. Raises JointAnglesError: ``limits``, ``too_few``.
+    Joints that the pixels do not determine have a large standard deviation. Raises JointAnglesError: ``limits``,
+    ``too_few``.
     """
     seen = problem.seen
     _require_enough(problem)
@@ -142,7 +144,7 @@ def refined_joints(
 
 
 def _require_enough(problem: JointProblem) -> None:
-    """Raises JointAnglesError where there are fewer coordinates than joints."""
+    """Raise JointAnglesError if there are fewer coordinates than joints."""
     n = problem.seen.chain.joints
     if problem.measurements < n:
         raise JointAnglesError(
@@ -169,8 +171,8 @@ def _outside(q: FloatArray, bounds: FloatArray) -> JointAnglesError:
 
 
 def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]:
-    """Ends of the search, of ``costs`` (s,), that the pixels do not rule out, the best first. Raises
-    JointAnglesError where even the best does not explain them.
+    """Indices of the end points of a search, with ``costs`` (s,), that are consistent with the pixels, the best first.
+    Raises JointAnglesError if even the best does not explain the pixels.
     """
     best = float(costs.min())
     freedom = max(0, problem.freedom)
@@ -190,7 +192,7 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
 
 
 def _distinct_configurations(problem: JointProblem, q: FloatArray, costs: FloatArray) -> list[JointAngles]:
-    """Distinct configurations from ends ``q`` (s, n) in order of their ``costs`` (s,)."""
+    """Distinct configurations among the end points ``q`` (s, n), in order of their ``costs`` (s,)."""
     found: list[JointAngles] = []
     for end, cost in zip(q, costs, strict=True):
         slope = problem.linearise(end[None])[1][0]
@@ -204,9 +206,9 @@ def _distinct_configurations(problem: JointProblem, q: FloatArray, costs: FloatA
 
 @dataclass(frozen=True, eq=False)
 class Homing:
-    """Result of homing: ``displacement`` (n,) = home less current joints [rad or m], with ``covariance`` (n, n)
-    that includes the noise of both images; ``current`` as measured; other displacements that the image admits:
-    ``alternatives``.
+    """Result of homing: ``displacement`` (n,) = home minus current joints [rad or m], with ``covariance`` (n, n) that
+    includes the noise of both images; ``current``: the measured joints; ``alternatives``: other displacements that are
+    consistent with the image.
     """
 
     displacement: FloatArray
@@ -222,11 +224,11 @@ def homing_problem(
     pixels: FloatArray,
     sigma: FloatArray | float,
 ) -> JointProblem:
-    """The problem (4.45) of pixels (c, m, 2) [px] of one static point or more, which were at ``home_pixels`` (c, m,
-    2) in the configuration ``home`` (n,).
+    """The problem (4.45) of pixels (c, m, 2) [px] of one or more static points, which were at ``home_pixels`` (c, m, 2)
+    in the configuration ``home`` (n,).
 
-    The points are reconstructed from the home images, and weigh by their covariance from there on. Raises
-    JointAnglesError where no point is seen by two cameras at home.
+    The points are reconstructed from the home images and weighted by their covariance. Raises JointAnglesError if no
+    point is seen by two cameras at home.
     """
     points, covariance = points_seen(seen, home, home_pixels, sigma)
     if not np.isfinite(points).all(axis=1).any():
@@ -252,9 +254,9 @@ def homing_displacement(
 
 @dataclass(frozen=True, eq=False)
 class JointZeros:
-    """``offset`` (n,) [rad or m] to add to the encoders so that they read what the cameras see, ``deviations`` (n,) and
-    ``covariance`` (n, n) of it; ``cost``, ``freedom``; ``alternatives`` that the images leave possible, farther from
-    the readings: where there is one, nothing is told of the zeros.
+    """``offset`` (n,) [rad or m] to add to the encoder readings so that they agree with the cameras, with its
+    ``deviations`` (n,) and ``covariance`` (n, n); ``cost``, ``freedom``; ``alternatives``: other offsets that are
+    consistent with the images, farther from the readings. If there is one, the zeros are not determined.
     """
 
     offset: FloatArray
@@ -278,9 +280,9 @@ def joint_zeros(
 ) -> JointZeros:
     """Offsets of the joints' zeros from raw ``pixels`` (k, c, m, 2) [px] at readings ``encoders`` (k, n) [rad or m].
 
-    One stop will do where it shows enough; more stops add up. ``limits`` (n, 2) are those of the offsets, default a
-    full turn and, for prismatic joints, 1 m to either side. Raises JointAnglesError as `measured_joints` does:
-    ``not_observable`` names the joints that the images do not determine.
+    One stop is enough if it determines all joints; further stops are combined with it. ``limits`` (n, 2): limits of the
+    offsets, by default one full turn and, for prismatic joints, ± 1 m. Raises JointAnglesError as `measured_joints`
+    does: ``not_observable`` names the joints that the images do not determine.
     """
     kinds = seen.chain.kinds
     default = np.array([[-np.pi, np.pi] if kind == "revolute" else [-1.0, 1.0] for kind in kinds])
@@ -293,7 +295,7 @@ def joint_zeros(
         point_covariance=point_covariance,
     )
     found = measured_joints(problem, limits=default if limits is None else limits, largest_deviation=largest_deviation)
-    # The images tell these from each other by chance alone.
+    # Differences between these in the images are within the noise.
     nearest, *others = sorted(found, key=lambda angles: float(np.linalg.norm(angles.q)))
     return JointZeros(
         nearest.q,
@@ -307,8 +309,8 @@ def joint_zeros(
 
 @dataclass(frozen=True)
 class TellingMotion:
-    """A motion of one joint, by index, by ``step`` [rad or m], after which ``told`` of the pairs of postures that show
-    the same images differ in them; ``pixels``: the least distance [px] of these.
+    """A motion of one joint (by index) by ``step`` [rad or m] that distinguishes postures with the same images: after
+    it, ``told`` pairs of postures differ in their images, by at least ``pixels`` [px].
     """
 
     joint: int
@@ -325,10 +327,11 @@ def telling_motion(
     step: float,
     least_px: float,
 ) -> TellingMotion | None:
-    """Motion of one joint by ``step`` [rad or m] to either side that tells most of the ``postures`` (p, n), which show
-    the same images, from each other, by ``least_px`` or more at a marker inside an image; None where none does.
+    """Motion of one joint by ±``step`` [rad or m] that distinguishes the most pairs of the ``postures`` (p, n), which
+    have the same images: a marker inside an image then differs by ``least_px`` or more. None if there is no such
+    motion.
 
-    ``readings`` (n,) stay within ``limits`` (n, 2), those of the cell.
+    ``readings`` (n,) stay within ``limits`` (n, 2), the joint limits of the cell.
     """
     first, second = np.triu_indices(len(postures), 1)
     sizes = np.array([[camera.width, camera.height] for camera in model.cameras], dtype=np.float64)
@@ -348,10 +351,10 @@ def telling_motion(
 
 
 def sensitivity(problem: JointProblem, changed: JointProblem, opposite: JointProblem, q: FloatArray) -> FloatArray:
-    """Change (n,) of the measured joints, at ``q`` (n,), by half the difference of two calibrations.
+    """Change (n,) of the measured joints at ``q`` (n,) for half the difference of two calibrations.
 
-    First order: ``-(JᵀJ)⁻¹ Jᵀ (r₊ - r₋)/2``; with the calibration's covariance as columns of a root, the sum of
-    their outer squares is what the calibration adds to the joints' covariance.
+    First order: ``-(JᵀJ)⁻¹ Jᵀ (r₊ - r₋)/2``. If the calibrations differ by the columns of a root of the calibration's
+    covariance, the sum of the outer products is the calibration's contribution to the joints' covariance.
     """
     _, slope, _ = problem.linearise(q[None])
     plus, minus = (p.linearise(q[None])[0][0] for p in (changed, opposite))
@@ -359,7 +362,7 @@ def sensitivity(problem: JointProblem, changed: JointProblem, opposite: JointPro
 
 
 def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> FloatArray:
-    """Limits (n, 2), a full turn about the zero where none are given."""
+    """Limits (n, 2); by default a full turn about the zero."""
     n = seen.chain.joints
     if limits is not None:
         bounds = np.asarray(limits, dtype=np.float64)
@@ -384,7 +387,7 @@ def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> Float
 
 
 def _starts(bounds: FloatArray) -> FloatArray:
-    """Start configurations (s, n): a grid, or an even sequence, over the limits (n, 2)."""
+    """Start configurations (s, n): a grid, or a low-discrepancy sequence, over the limits (n, 2)."""
     n = len(bounds)
     per_joint = min(GRID, int(STARTS ** (1.0 / n) + 1e-9))
     if per_joint >= 8:
@@ -396,7 +399,7 @@ def _starts(bounds: FloatArray) -> FloatArray:
 
 
 def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Levenberg-Marquardt from all starts ``q`` (s, n) at once: end configurations, costs (s,), in front (s,)."""
+    """Levenberg-Marquardt from all starts ``q`` (s, n) at once: end configurations, costs (s,), if in front (s,)."""
     q = q.copy()
     error, slope, front = linearise(q)
     cost = (error**2).sum(axis=1)
@@ -419,7 +422,7 @@ def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArra
         won = active[better]
         q[won] += step[better]
         error[won], slope[won], front[won] = new_error[better], new_slope[better], new_front[better]
-        # At the least cost the next one is larger as often as not, by its rounding.
+        # At the minimum, the next cost may be larger by rounding.
         settled = np.abs(new_cost - before) <= SETTLED * (new_cost + 1e-18)
         settled |= np.abs(step).max(axis=1) < SETTLED
         cost[won] = new_cost[better]
@@ -448,7 +451,7 @@ def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
 
 
 def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
-    """Raise JointAnglesError where the pixels do not determine a joint's position at ``q`` (n,)."""
+    """Raise JointAnglesError if the pixels do not determine a joint's position at ``q`` (n,)."""
     slope = problem.linearise(q[None])[1][0]
     _, singular, rows = np.linalg.svd(slope, full_matrices=len(slope) < len(q))
     padded = np.zeros(len(q))
@@ -468,8 +471,9 @@ def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
 
 
 def _same(difference: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
-    """Whether two ends of a search, ``apart`` (n,) and ``worse`` in cost, are one configuration: within a tenth of
-    a deviation, or in one basin of attraction, where the cost grows as the square of the distance.
+    """Whether two end points of a search are the same configuration; they differ by ``difference`` (n,) and in cost by
+    ``worse``. They are the same within a tenth of a standard deviation, or in one basin of attraction, where the cost
+    grows as the square of the distance.
     """
     revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
     difference = np.where(revolute, np.mod(difference + np.pi, 2.0 * np.pi) - np.pi, difference)

@@ -1,8 +1,8 @@
 """Reprojection error of known points as a function of the joint angles, for many configurations at once: residuals,
 derivatives, predicted pixels; and the known points, triangulated from images.
 
-The thesis's objective (4.42) over the joint angles (4.45), for any chain, mount and number of cameras. Points may
-carry a covariance; the residuals are then whitened by what pixels and points leave open together.
+The thesis's objective (4.42) over the joint angles (4.45), for any chain, mount and number of cameras. Points may carry
+a covariance; the residuals are then whitened by the joint covariance of pixels and points.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 
 class JointAnglesError(ValueError):
-    """Joint angles cannot be estimated from the images; the text holds the cause, the value and what would suffice.
+    """Joint angles cannot be estimated from the images; the message states the cause, the value and the valid range.
 
     Attributes:
         code: ``shape``, ``too_few``, ``limits``, ``not_observable``, ``no_agreement``, ``outside_limits``.
@@ -37,8 +37,8 @@ class JointAnglesError(ValueError):
 @dataclass(frozen=True, eq=False)
 class SeenChain:
     """A chain and the cameras that observe its points, or are mounted on it: ``cameras`` (c, 3, 4) to ideal pixels,
-    ``lenses`` (c, 4) or (c, 7) from them to raw ones. Third rows of the cameras are positive on points in front, as a
-    calibration gives them.
+    ``lenses`` (c, 4) or (c, 7) from them to raw ones. The third row of each camera is positive for points in front, as
+    in calibrated models.
     """
 
     chain: ProjectiveChain
@@ -100,9 +100,9 @@ def pinhole_lenses(cameras: int) -> FloatArray:
 class JointProblem:
     """Least-squares problem of one unknown ``q`` (n,): pixels of known points at joints ``q + offsets[k]``.
 
-    ``points`` (m, 4) at the chain's zero; ``point_roots`` (m, 4, 4) with ``root rootᵀ`` their covariance, or None
-    where they are exact; ``pixels`` (k, c, m, 2) ideal [px], 0 where missing; ``roots`` (k, c, m, 2, 2) [1/px] that
-    whiten them, 0 where missing; ``offsets`` (k, n).
+    ``points`` (m, 4) at the chain's zero; ``point_roots`` (m, 4, 4) with ``root rootᵀ`` their covariance, or None if
+    they are exact; ``pixels`` (k, c, m, 2) ideal [px], 0 where missing; ``roots`` (k, c, m, 2, 2) [1/px] that whiten
+    them, 0 where missing; ``offsets`` (k, n).
     """
 
     seen: SeenChain
@@ -119,13 +119,13 @@ class JointProblem:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom: measurements less parameters (uncertain points count as both)."""
+        """Degrees of freedom: measurements minus parameters (uncertain points count as both)."""
         return self.measurements - self.seen.chain.joints
 
     def moved(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
-        """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives in the joints (s, k, c, m, 3, n) at
-        configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether each lies in front of every camera that
-        sees it (s,).
+        """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives with respect to the joints
+        (s, k, c, m, 3, n) at configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether all points lie in front
+        of the cameras that see them (s,).
         """
         s, n = q.shape
         k = len(self.offsets)
@@ -139,8 +139,8 @@ class JointProblem:
         return np.moveaxis(images, -1, -2), np.moveaxis(changes, (-1, -3), (-3, -1)), through, front
 
     def linearise(self, q: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Whitened residuals (s, r) (predicted less measured pixels), derivatives (s, r, n), and in front (s,), at
-        configurations ``q`` (s, n).
+        """Whitened residuals (s, r) (predicted minus measured pixels), derivatives (s, r, n), and whether in front
+        (s,), at configurations ``q`` (s, n).
         """
         images, changes, through, front = self.moved(q)
         here = self.roots[..., 0, 0] > 0
@@ -155,15 +155,15 @@ class JointProblem:
         if self.point_roots is not None:
             lever = through[:, :, :, None, :2] - predicted[..., None] * through[:, :, :, None, 2:]
             lever = np.moveaxis(scaled @ lever @ self.point_roots, 3, 1).reshape(s, len(self.points), -1, 4)
-            # What the points' own uncertainty adds to the pixels' unit noise.
+            # Contribution of the points' uncertainty to the pixels' unit noise.
             factor = np.linalg.cholesky(np.eye(lever.shape[2]) + lever @ lever.swapaxes(-1, -2))
             error = np.linalg.solve(factor, error[..., None])[..., 0]
             slope = np.linalg.solve(factor, slope)
         return error.reshape(s, -1), slope.reshape(s, -1, n), front
 
     def linearise_rays(self, q: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Like `linearise`, with unit rays in place of pixels: bounded, and valid behind a camera, as a search from
-        far away needs.
+        """Like `linearise`, with unit rays instead of pixels: bounded, and valid behind a camera, for a search from a
+        distant start.
         """
         images, changes, _, front = self.moved(q)
         blocks = np.linalg.inv(self.seen.cameras[:, :, :3])[:, None]
@@ -191,9 +191,9 @@ def joint_problem(
 ) -> JointProblem:
     """The problem of raw ``pixels`` (c, m, 2), or (k, c, m, 2) at joints that differ by ``offsets`` (k, n).
 
-    ``points`` (m, 4) at the chain's zero, NaN where one is to be left out, of ``point_covariance`` (m, 4, 4), default
-    exact; ``sigma``, a number or of the pixels' shape [px]; NaN pixels are missing. Raises JointAnglesError for
-    shapes that do not fit, a sigma that is not positive, no pixels.
+    ``points`` (m, 4) at the chain's zero, NaN for excluded points, with ``point_covariance`` (m, 4, 4), default exact;
+    ``sigma`` [px]: a number, or an array of the pixels' shape; NaN pixels are missing. Raises JointAnglesError for
+    wrong shapes, a sigma that is not positive, no pixels.
     """
     n, c = seen.chain.joints, len(seen.cameras)
     images = pixels[None] if pixels.ndim == 3 else pixels
@@ -231,15 +231,15 @@ def joint_problem(
 def points_seen(
     seen: SeenChain, q: FloatArray, pixels: FloatArray, sigma: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
-    """Points (m, 4) at the chain's zero, and their covariance (m, 4, 4), from raw ``pixels`` (c, m, 2) [px] at
-    ``q`` (n,).
+    """Points (m, 4) at the chain's zero, and their covariance (m, 4, 4), from raw ``pixels`` (c, m, 2) [px] at ``q``
+    (n,).
 
-    NaN and 0 where fewer than two cameras see a point. Depth is 1 in the first camera at ``q``. Raises
-    JointAnglesError for shapes that do not fit.
+    NaN and 0 if fewer than two cameras see a point. Depth is 1 in the first camera at ``q``. Raises JointAnglesError
+    for wrong shapes.
     """
     here = joint_problem(seen, np.zeros((pixels.shape[-2], 4)), pixels, sigma)
     given = here.roots[0, ..., 0, 0] > 0
-    # One standard deviation a camera and point: the geometric mean of the bent lens's two.
+    # One standard deviation per camera and point: the geometric mean of the two after undistortion.
     noise = 1.0 / np.sqrt(np.where(given, np.abs(np.linalg.det(here.roots[0])), 1.0))
     points = triangulate(seen.cameras, np.where(given[..., None], here.pixels[0], np.nan), noise)
     known = np.isfinite(points).all(axis=1)

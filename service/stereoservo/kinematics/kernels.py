@@ -1,9 +1,8 @@
 """Numba kernels for the control loop: forward kinematics, projection, image Jacobian, triangulation, lens distortion.
 The same as `chain` and `geometry.cameras`, without BLAS, LAPACK or fastmath.
 
-Explicit loops in a fixed order: the same input gives the same bits on one machine. All arrays are float64 and
-C-contiguous; joint kinds are uint8, 0 revolute, 1 prismatic. The ``*_into`` forms write into arrays of the
-caller.
+Explicit loops in a fixed order: the same input gives bitwise the same result on one machine. All arrays are float64 and
+C-contiguous; joint kinds are uint8, 0 revolute, 1 prismatic. The ``*_into`` functions write into arrays of the caller.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, KindArray
 from stereoservo.numerics.compilation import kernel
 
 PIVOT_TOLERANCE = 1e-14
-"""Relative Cholesky pivot below which a point's rays count as one."""
+"""Relative Cholesky pivot below which a point's rays count as coincident."""
 
 
 @kernel
 def multiply4_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
-    """``out = A B`` for (4, 4); ``out`` must be neither of them."""
+    """``out = A B`` for (4, 4); ``out`` must not alias ``A`` or ``B``."""
     for i in range(4):
         for j in range(4):
             out[i, j] = A[i, 0] * B[0, j] + A[i, 1] * B[1, j] + A[i, 2] * B[2, j] + A[i, 3] * B[3, j]
@@ -54,7 +53,7 @@ def chain_forward_into(chain: Chain, q: FloatArray, H: FloatArray, operators: Fl
     for nth in range(n):
         j = n - 1 - nth if tip_first else nth
         G = generators[j]
-        # With O = H̄ Ĥ H̄⁻¹ at hand, exp(sĤ) moves through: H̄ exp(sĤ) = exp(sO) H̄ = H̄ + sin s H̄Ĥ + (1 −
+        # With O = H̄ Ĥ H̄⁻¹ known, exp(sĤ) moves to the left: H̄ exp(sĤ) = exp(sO) H̄ = H̄ + sin s H̄Ĥ + (1 −
         # cos s) H̄Ĥ².
         multiply4_into(H, G, first)
         multiply4_into(first, inverse, operators[j])
@@ -95,7 +94,7 @@ def chain_forward(
 
 @kernel
 def transform_points_into(H: FloatArray, M: FloatArray, out: FloatArray) -> None:
-    """``H M`` of points (m, 4) into (m, 4), which must not be ``M``."""
+    """``H M`` of points (m, 4) into ``out`` (m, 4), which must not be ``M``."""
     for p in range(M.shape[0]):
         for i in range(4):
             out[p, i] = H[i, 0] * M[p, 0] + H[i, 1] * M[p, 1] + H[i, 2] * M[p, 2] + H[i, 3] * M[p, 3]
@@ -111,7 +110,7 @@ def transform_points(H: FloatArray, M: FloatArray) -> FloatArray:
 
 @kernel
 def invert4(H: FloatArray) -> FloatArray:
-    """Inverse (4, 4) by 2x2 minors; all NaN where the determinant is zero or not finite."""
+    """Inverse (4, 4) by 2x2 minors; all NaN if the determinant is zero or not finite."""
     s0 = H[0, 0] * H[1, 1] - H[1, 0] * H[0, 1]
     s1 = H[0, 0] * H[1, 2] - H[1, 0] * H[0, 2]
     s2 = H[0, 0] * H[1, 3] - H[1, 0] * H[0, 3]
@@ -153,9 +152,7 @@ def invert4(H: FloatArray) -> FloatArray:
 
 @kernel
 def project_points(Ps: FloatArray, M: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pixels (c, m, 2) and depths (c, m) of points (m, 4) in cameras (c, 3, 4); NaN pixels where the depth
-    is 0.
-    """
+    """Pixels (c, m, 2) and depths (c, m) of points (m, 4) in cameras (c, 3, 4); NaN pixels if the depth is 0."""
     cameras, points = Ps.shape[0], M.shape[0]
     pixels = np.empty((cameras, points, 2))
     depths = np.empty((cameras, points))
@@ -173,10 +170,10 @@ def project_points(Ps: FloatArray, M: FloatArray) -> tuple[FloatArray, FloatArra
 
 @kernel
 def image_jacobian(operators: FloatArray, Ps: FloatArray, M: FloatArray) -> FloatArray:
-    """``J_G P Ĥ_j|_Q M`` (c, m, 2, n) [px/rad or px/m] for operators (n, 4, 4), cameras (c, 3, 4), points (m,
-    4) (8.33).
+    """``J_G P Ĥ_j|_Q M`` (c, m, 2, n) [px/rad or px/m] for operators (n, 4, 4), cameras (c, 3, 4), points (m, 4)
+    (8.33).
 
-    NaN where a point lies in a camera's focal plane.
+    NaN if a point lies in a camera's focal plane.
     """
     n, cameras, points = operators.shape[0], Ps.shape[0], M.shape[0]
     out = np.empty((cameras, points, 2, n))
@@ -270,7 +267,7 @@ def _views(weights: FloatArray, p: int) -> int:
 
 @kernel
 def _eliminated_and_free(row: FloatArray) -> tuple[int, int, int, int]:
-    """Index of the largest entry of ``row`` (4,) by size, and the three others in order."""
+    """Index of the entry of ``row`` (4,) of largest magnitude, and the three others in order."""
     k = 0
     for i in range(1, 4):
         if abs(row[i]) > abs(row[k]):
@@ -279,8 +276,8 @@ def _eliminated_and_free(row: FloatArray) -> tuple[int, int, int, int]:
 
 
 class Views(NamedTuple):
-    """What c cameras ``Ps`` (c, 3, 4) see of m points: ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma [1/px],
-    0 where missing.
+    """Observations of m points by c cameras ``Ps`` (c, 3, 4): ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma
+    [1/px], 0 where missing.
     """
 
     Ps: FloatArray
@@ -290,12 +287,12 @@ class Views(NamedTuple):
 
 @kernel
 def _triangulate_point(views: Views, p: int, iterations: int, M: FloatArray, work: FloatArray) -> bool:
-    """One point into ``M[p]``; ``work`` (3,) scratch. False where its rays do not determine it."""
+    """Triangulate one point into ``M[p]``; ``work`` (3,) is scratch. False if its rays do not determine it."""
     Ps, pixels, weights = views
     cameras = Ps.shape[0]
     if _views(weights, p) < 2:
         return False
-    # Depth 1 in camera 0 is kept by eliminating the coordinate k that its third row weighs most.
+    # Depth 1 in camera 0: coordinate k, with the largest entry of its third row, is eliminated.
     k, i0, i1, i2 = _eliminated_and_free(Ps[0, 2])
     pivot = Ps[0, 2, k]
     f0, f1, f2 = -Ps[0, 2, i0] / pivot, -Ps[0, 2, i1] / pivot, -Ps[0, 2, i2] / pivot
@@ -356,7 +353,7 @@ def _triangulate_point(views: Views, p: int, iterations: int, M: FloatArray, wor
         M[p, i1] += work[1]
         M[p, i2] += work[2]
         M[p, k] += f0 * work[0] + f1 * work[1] + f2 * work[2]
-    # One sum tells whether all are finite: NaN and infinities survive it.
+    # The sum is finite only if all entries are.
     return math.isfinite(abs(M[p, 0]) + abs(M[p, 1]) + abs(M[p, 2]) + abs(M[p, 3]))
 
 
@@ -380,9 +377,9 @@ def triangulate(
 ) -> tuple[FloatArray, BoolArray]:
     """Points (m, 4) of least reprojection error at depth 1 in camera 0, and validity (m,) bool (2.71, 2.73).
 
-    ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma [1/px], 0 where missing (the pixel is then not
-    read). A linear solution, then ``iterations`` renormalised ones. NaN rows where fewer than two cameras see
-    a point or its rays do not determine it.
+    ``pixels`` (c, m, 2) [px], ``weights`` (c, m) = 1/sigma [1/px], 0 where missing (the pixel is then not read). A
+    linear solution, then ``iterations`` renormalised ones. NaN rows if fewer than two cameras see a point or its rays
+    do not determine it.
     """
     M = np.empty((pixels.shape[1], 4))
     ok = np.empty(pixels.shape[1], dtype=np.bool_)
@@ -422,13 +419,13 @@ def exp_twist(G: FloatArray) -> FloatArray:
 
 
 ITERATIONS = 30
-"""Newton steps of the inverse at most."""
+"""Largest number of Newton steps of the inverse."""
 CONVERGED = 1e-14
-"""Step, relative to the radius, at which the inverse ends."""
+"""Step, relative to the radius, at which the inverse has converged."""
 FARTHEST = 20.0
-"""Ideal radius [r0] beyond which a lens of several terms images nothing."""
+"""Largest ideal radius [r0] of the field of view of a lens of several terms."""
 MET = 1e-10
-"""Error [r0] of an inverse through tangential terms above which there is none."""
+"""Error [r0] of the inverse with tangential terms above which it does not exist."""
 
 
 @kernel
@@ -442,7 +439,7 @@ def _fold_square(lens: FloatArray) -> float:
 
 @kernel
 def _distorted_offset(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
-    """Raw offset [r0] from the centre of a lens (7,), of an ideal one."""
+    """Raw offset [r0] from the centre of a lens (7,) for an ideal offset ``(x, y)`` [r0]."""
     k, k2, p1, p2 = lens[0], lens[4], lens[5], lens[6]
     s = x * x + y * y
     stretch = 1.0 + s * (k + s * k2)
@@ -472,8 +469,8 @@ def distortion_jacobian(lens: FloatArray, u: float, v: float) -> tuple[float, fl
 
 @kernel
 def _undistorted_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Ideal pixel of the raw one through a lens (7,): Newton's method within brackets on the radius, then on both
-    coordinates; NaN where there is none.
+    """Ideal pixel of the raw one for a lens (7,): bracketed Newton's method on the radius, then on both coordinates;
+    NaN if there is none.
     """
     k, r0, k2 = lens[0], lens[3], lens[4]
     goal_x, goal_y = (u - lens[1]) / r0, (v - lens[2]) / r0
@@ -520,7 +517,7 @@ def _undistorted_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, flo
 @kernel
 def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
     """Raw pixel of the ideal one ``(u, v)``; NaN beyond the fold. ``lens`` (4,) or (7,) as in `geometry.distortion`; a
-    lens (4,) of ``k = 0`` leaves it as it is, to the bit.
+    lens (4,) with ``k = 0`` returns it unchanged, bit for bit.
     """
     k, r0 = lens[0], lens[3]
     if len(lens) > 4:
@@ -540,9 +537,9 @@ def distort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
 
 @kernel
 def undistort_pixel(lens: FloatArray, u: float, v: float) -> tuple[float, float]:
-    """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN where there is none.
+    """Ideal pixel of the raw one ``(u, v)`` by Newton's method on the radius; NaN if there is none.
 
-    A lens (4,) of ``k = 0`` leaves it as it is, to the bit.
+    A lens (4,) with ``k = 0`` returns it unchanged, bit for bit.
     """
     k, r0 = lens[0], lens[3]
     if len(lens) > 4:

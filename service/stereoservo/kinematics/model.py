@@ -34,8 +34,8 @@ def pinhole() -> FloatArray:
 class CameraModel(msgspec.Struct, frozen=True, eq=False):
     """A camera in the model's projective frame: ``matrix`` (3, 4) maps points to ideal pixels; image size [px].
 
-    ``lens`` (4,) or (7,): distortion ``(k, cu, cv, r0)``, or with the terms ``(k2, p1, p2)`` behind, from ideal to raw
-    pixels, see `geometry.distortion`; of one length in all cameras of a model.
+    ``lens`` (4,) or (7,): distortion ``(k, cu, cv, r0)``, or with the terms ``(k2, p1, p2)`` appended, from ideal to
+    raw pixels, see `geometry.distortion`; of equal length in all cameras of a model.
     """
 
     name: str
@@ -46,10 +46,10 @@ class CameraModel(msgspec.Struct, frozen=True, eq=False):
 
 
 class JointStatistics(msgspec.Struct, frozen=True):
-    """Fit of one joint's trial motion: residual rms [px], number of stops, range driven [rad or m].
+    """Fit of one joint's trial motion: residual rms [px], number of stops, range of motion [rad or m].
 
-    ``expected_px``: what the rms should be at the stated sigmas, ``σ √(1 - trace(H_j) / n_j)`` with the trial's own
-    share of the hat matrix; ``standard_error_px``: of the rms about it. None in files written before.
+    ``expected_px``: expected rms at the stated sigmas, ``σ √(1 - trace(H_j) / n_j)`` with the trial's block of the hat
+    matrix; ``standard_error_px``: standard deviation of the rms about it. None in older files.
     """
 
     name: str
@@ -63,8 +63,8 @@ class JointStatistics(msgspec.Struct, frozen=True):
 class FitStatistics(msgspec.Struct, frozen=True, eq=False):
     """Statistics of the final least-squares fit.
 
-    ``chi2`` is the sum of squared residuals in sigmas, with ``degrees_of_freedom`` = measurements -
-    parameters net of gauge; ``chi2_ok``: inside the 99.9 % interval.
+    ``chi2``: sum of squared residuals in sigmas, with ``degrees_of_freedom`` = measurements - parameters net of gauge;
+    ``chi2_ok``: inside the 99.9 % interval.
     """
 
     rms_px: float
@@ -79,13 +79,12 @@ class FitStatistics(msgspec.Struct, frozen=True, eq=False):
 
 
 class JointLoads(msgspec.Struct, frozen=True, eq=False):
-    """Joint loads that the drives reported in the trial motions; the thresholds of collision detection come from
-    them.
+    """Joint loads that the drives reported in the trial motions; the thresholds of collision detection come from them.
 
-    ``efforts`` (n, n) [N m or N, or shares of the rated torque]: entry (j, k) is the farthest that joint j's effort
-    went from its moving mean, and stayed for a few samples, while joint k moved. ``largest_efforts`` (n,): largest
-    magnitude of all. ``following_errors`` (n,): likewise, from zero [rad or m]. ``velocities`` (n,): highest speed
-    commanded [rad/s or m/s]. None where the drives do not report them.
+    ``efforts`` (n, n) [N m or N, or fractions of the rated torque]: entry (j, k) is the largest deviation of joint j's
+    effort from its moving mean that lasted for a few samples while joint k moved. ``largest_efforts`` (n,): largest
+    magnitude of all. ``following_errors`` (n,): likewise, from zero [rad or m]. ``velocities`` (n,): highest commanded
+    speed [rad/s or m/s]. None if the drives do not report them.
     """
 
     velocities: FloatArray
@@ -102,13 +101,13 @@ class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
     - ``generators``: for each joint directions D (p_j, 4, 4); a parameter changes the generator by ``[D, G]``, at
       finite values by ``T G T⁻¹``, ``T = (I - Δ/2)⁻¹ (I + Δ/2)``, ``Δ = Σ x_k D_k``: the algebra stays exact.
     - ``cameras``: for each camera directions (p_c, 3, 4) of its matrix.
-    - ``lenses``: for each camera directions (p_l, 4 or 7) of its lens; none where it is a pinhole.
+    - ``lenses``: for each camera directions (p_l, 4 or 7) of its lens; none for a pinhole camera.
     - ``markers``: for each marker directions (p_m, 4) of its point.
 
-    A gauge is fixed: only functions of the model that no change of frame alters, within the group of its stratum,
-    have a covariance that means anything. ``plane_at_infinity`` and ``projective_to_euclidean`` stay as they are.
-    `kinematics.covariance` propagates to any such function. At the larger of the stated and, where the residuals
-    do not agree with it, the estimated noise.
+    A gauge is fixed: only functions that are invariant under changes of frame within the group of the stratum have a
+    meaningful covariance; `kinematics.covariance` propagates to any such function. ``plane_at_infinity`` and
+    ``projective_to_euclidean`` are constant. The noise is the stated one, or, if the residuals do not agree with it,
+    the larger of the stated and the estimated one.
     """
 
     generators: tuple[FloatArray, ...]
@@ -124,9 +123,10 @@ class ModelCovariance(msgspec.Struct, frozen=True, eq=False):
 
 
 class MarkerGroup(msgspec.Struct, frozen=True):
-    """Coplanar markers, by their indices in the model: ``members``, ascending, and the ``triple`` that tells the plane.
+    """Coplanar markers, by their indices in the model: ``members``, ascending, and the ``triple`` that defines the
+    plane.
 
-    ``above``, ``below``: how many of the other markers lie on either side; ``roundness``: altitude of the triple over
+    ``above``, ``below``: number of the other markers on either side; ``roundness``: altitude of the triple divided by
     the extent of the group. See `control.marker_groups`.
     """
 
@@ -140,15 +140,15 @@ class MarkerGroup(msgspec.Struct, frozen=True):
 class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Calibrated model: projective kinematics, cameras and markers in one projective frame.
 
-    ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i),
-    prismatic ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
-    ``plane_at_infinity @ M == 1``. ``projective_to_euclidean`` (4, 4): H_PE up to one global scale, where the
-    stratum is ``metric``. ``mount``: of all its cameras; eye-in-hand chains
-    are ``tip_first``. ``epoch`` is unique for each model a cell ever had.
+    ``generators`` (n, 4, 4): joint operators at ``zero`` (n,), revolute ones with eigenvalues (0, 0, i, -i), prismatic
+    ones nilpotent (5.18). ``marker_points`` (m, 4): markers at the zero, orbital heights such that
+    ``plane_at_infinity @ M == 1``. ``projective_to_euclidean`` (4, 4): H_PE up to one global scale, if the stratum is
+    ``metric``. ``mount``: of all its cameras; eye-in-hand chains are ``tip_first``. ``epoch`` is unique among all
+    models of a cell.
 
-    Stratum ``projective``: the plane at infinity is not identifiable (such as with all axes parallel);
-    ``plane_at_infinity`` is then the least singular vector of (5.59): joints keep the heights ``a @ M`` that
-    it gives, but parallelism must not be read from it.
+    Stratum ``projective``: the plane at infinity is not identifiable (for example, all axes are parallel);
+    ``plane_at_infinity`` is then the least singular vector of (5.59): joints preserve its heights ``a @ M``, but it
+    does not determine parallelism.
     """
 
     schema: int
@@ -174,15 +174,15 @@ class CellModel(msgspec.Struct, frozen=True, eq=False):
     """Static scene points (s, 4) of height 1, with ``scene_covariances`` (s, 4, 4) at that scale, given the cameras."""
     scene_covariances: FloatArray = msgspec.field(default_factory=lambda: np.zeros((0, 4, 4)))
     marker_groups: tuple[MarkerGroup, ...] | None = None
-    """Coplanar groups of its markers; None where they have not been looked for."""
+    """Coplanar groups of its markers; None if they have not been searched for."""
     joint_accuracy: JointAccuracy | None = None
-    """Errors of the joint readings; None where none are known: predictions then take them for exact."""
+    """Errors of the joint readings; None if unknown: predictions then assume exact readings."""
     shutter_offsets: tuple[ShutterOffset, ...] = ()
-    """Of the cameras whose stamps the trial motions could tell against the joints' stamps."""
+    """Offsets of the cameras whose stamps were calibrated against the joints' stamps by the trial motions."""
     refined_from: int = 0
-    """Epoch of the model that this one was refined from on-line; 0: it was not."""
+    """Epoch of the model from which this one was refined on-line; 0: not refined."""
     in_place_of: int = 0
-    """Epoch of the model whose taught goals this one takes over, for nothing but the estimate changed; 0: of none."""
+    """Epoch of the model whose taught goals remain valid for this one, because only the estimate changed; 0: none."""
 
     @property
     def tip_first(self) -> bool:
@@ -195,7 +195,7 @@ class ModelFileError(DamagedError):
 
     Attributes:
         path: the file, or ``"<model>"`` for a model in memory.
-        key: the field that does not fit; empty where it is the file as a whole.
+        key: the invalid field; empty for the file as a whole.
     """
 
     def __init__(self, path: Path | str, key: str, message: str) -> None:
@@ -205,21 +205,21 @@ class ModelFileError(DamagedError):
 
 
 MAX_BEND = 1.0
-"""Largest radial parameter of a lens, at its reference radius: no image is read through more."""
+"""Largest radial parameter of a lens, at its reference radius: images with more distortion cannot be used."""
 RANK_TOLERANCE = 1e-12
 """Least singular value of a matrix of rank 3 or 4, relative to its size."""
 METRIC_TOLERANCE = 1e-5
-"""What H_PE may leave of an operator beside a Euclidean twist, relative to it."""
+"""Largest relative deviation from a Euclidean twist of an operator transformed by H_PE."""
 SYMMETRY_TOLERANCE = 1e-8
-"""How far a covariance, scaled to correlations, may be from symmetric and from positive semidefinite."""
+"""Largest deviation of a covariance, scaled to correlations, from a symmetric and positive semidefinite matrix."""
 ALGEBRA_TOLERANCE = 1e-6
 """Largest relative defect of ``Ĥ³ + Ĥ`` (revolute) or ``Ĥ²`` (prismatic) that a model may have."""
 
 
 def check_model(model: CellModel, path: Path | str = "<model>") -> None:
-    """Check shapes, finiteness and algebraic constraints of a model. Raises ModelFileError.
+    """Check shapes, finiteness and algebraic constraints of a model.
 
-    Raises ModelFileError naming the field, its value and what would have been valid.
+    Raises ModelFileError with the field, its value and the valid values.
     """
     if model.schema != MODEL_SCHEMA:
         raise ModelFileError(path, "schema", f"is {model.schema!r}; this version reads {MODEL_SCHEMA}")
@@ -290,7 +290,7 @@ def check_model(model: CellModel, path: Path | str = "<model>") -> None:
 
 
 def lens_size(cameras: tuple[CameraModel, ...]) -> int:
-    """How many numbers the lens of each of ``cameras`` has, by the first one: 7 with terms of distortion, else 4."""
+    """Number of lens parameters of each of ``cameras``, from the first one: 7 with further distortion terms, else 4."""
     return 7 if cameras and cameras[0].lens.shape == (7,) else 4
 
 
@@ -353,7 +353,7 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
                 f"cameras[{i}].lens",
                 f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_BEND:g} either way is taken",
             )
-        # Each row to one length: what is left is rank, not units.
+        # Rows of unit length: the result is the rank, independent of units.
         rows = np.linalg.norm(camera.matrix, axis=1)
         least = float(np.linalg.svd(camera.matrix / rows[:, None])[1][2]) if rows.all() else 0.0
         if not least > RANK_TOLERANCE:
@@ -385,7 +385,7 @@ def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> No
 
 
 def _check_scene(model: CellModel, path: Path | str) -> None:
-    """Check the static points: ids not on the arm, scales 1, covariances."""
+    """Check the static points: ids that are not on the arm, scales 1, covariances."""
     ids, points, covariances = model.scene_ids, model.scene_points, model.scene_covariances
     for marker in ids:
         if ids.count(marker) > 1:
@@ -509,7 +509,7 @@ def _decode_array(kind: type, value: object) -> object:
 
 
 def encode_model(model: CellModel) -> bytes:
-    """A model as one JSON object with a checksum, arrays as nested lists with every bit of a float64. Raises
+    """A model as one JSON object with a checksum, arrays as nested lists with the full precision of float64. Raises
     ModelFileError.
     """
     check_model(model)
@@ -517,7 +517,7 @@ def encode_model(model: CellModel) -> bytes:
 
 
 def decode_model(data: bytes, path: Path | str = "<model>") -> CellModel:
-    """Inverse of :func:`encode_model`, strictly. Raises ModelFileError, whatever the bytes."""
+    """Inverse of :func:`encode_model`, with strict checks. Raises ModelFileError for any invalid bytes."""
     with decoding(partial(ModelFileError, path, "")):
         with decoding(lambda cause: ModelFileError(path, "", f"is not JSON: {cause}")):
             tree = msgspec.json.decode(data)
@@ -550,7 +550,7 @@ def _converted(tree: Any, path: Path | str) -> CellModel:
 
 
 def _shaped(given: ModelCovariance, lens: int) -> ModelCovariance:
-    """Restore the shape of empty lists of directions, which JSON does not keep; ``lens``: numbers of a lens."""
+    """Restore the shape of empty lists of directions, which JSON does not preserve; ``lens``: parameters per lens."""
 
     def shaped(bases: tuple[FloatArray, ...], *shape: int) -> tuple[FloatArray, ...]:
         return tuple(basis if basis.size else np.zeros((0, *shape)) for basis in bases)
@@ -576,15 +576,15 @@ def load_model(path: Path) -> CellModel:
 
 
 # -- stamps of the shutters ----------------------------------------------------------------------------------
-# Offsets of the cameras' shutter stamps that a model states.
+# Offsets of the cameras' shutter stamps in a model.
 
 
 LONGEST_OFFSET_S = 1.0
-"""Largest offset of shutter stamps that a model may state."""
+"""Largest offset of shutter stamps in a model [s]."""
 
 
 class ShutterOffset(msgspec.Struct, frozen=True):
-    """By how much later than its stamps tell the shutter of ``camera`` opens [s], and its standard deviation [s]."""
+    """Delay of the shutter of ``camera`` relative to its stamps [s], and its standard deviation [s]."""
 
     camera: str
     offset_s: float
@@ -592,7 +592,9 @@ class ShutterOffset(msgspec.Struct, frozen=True):
 
 
 def offset_faults(offsets: Sequence[ShutterOffset], cameras: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """What is wrong with the offsets of a model's ``cameras``, by key: they are of these, once each, and bounded."""
+    """Faults of the offsets of a model's ``cameras`` as ``(key, fault)``: each names one of these, once, and is
+    bounded.
+    """
     for k, offset in enumerate(offsets):
         key = f"shutter_offsets[{k}]"
         if offset.camera not in cameras or any(other.camera == offset.camera for other in offsets[:k]):

@@ -1,9 +1,9 @@
 """Minimal local parameters of joint generators, cameras, lenses and points for least squares, without gauge freedoms
 (thesis 4.4, 5.4.2); exponentials of the joints' generators.
 
-A generator keeps its spectrum when it is conjugated, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the
-structure group of the stratum: GL(4), the affine or the similarity group. Directions of the group's algebra
-that commute with ``Ĥ₀`` change nothing; the chart is spanned by the rest. Their number is the minimal one:
+Conjugation preserves a generator's spectrum, so its neighbours are ``T Ĥ₀ T⁻¹`` with ``T`` from the structure group of
+the stratum: GL(4), the affine or the similarity group. Directions of the group's algebra that commute with ``Ĥ₀`` do
+not change it; the other directions span the chart. Their number is minimal:
 
     stratum      revolute   prismatic
     projective   10         6
@@ -23,7 +23,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 Kind = Literal["revolute", "prismatic"]
 LensModel = Literal["none", "radial", "radial_centre", "brown"]
-"""What of the lenses is free: nothing, one radial parameter a camera, that and its centre, or in addition the second
+"""Free lens parameters of each camera: none, one radial parameter, that and its centre, or in addition the second
 radial and both tangential terms.
 """
 LENS_PARAMETERS = (0, 1, 2, 4, 5, 6)
@@ -40,12 +40,12 @@ CHART_SIZE: dict[tuple[Stratum, Kind], int] = {
 
 
 def algebra(stratum: Stratum, kind: Kind) -> FloatArray:
-    """Basis (a, 4, 4) of the Lie algebra that moves a joint of ``kind``: gl(4), aff(3), or that of the
+    """Basis (a, 4, 4) of the Lie algebra whose group moves a joint of ``kind``: gl(4), aff(3), or that of the
     similarities.
 
-    Affine and metric algebras are those of a frame whose plane at infinity is (0, 0, 0, 1). Metric revolute
-    joints do without the scale: a scaling moves no axis that a translation does not, and Cayley's map of both
-    at once leaves the group.
+    Affine and metric algebras are those of a frame whose plane at infinity is (0, 0, 0, 1). The scale is omitted for
+    metric revolute joints: a translation can move the axis in the same way, and Cayley's map of both together is not in
+    the group.
     """
     full = np.eye(16).reshape(16, 4, 4)
     if stratum == "projective":
@@ -61,8 +61,7 @@ def algebra(stratum: Stratum, kind: Kind) -> FloatArray:
 
 
 def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> FloatArray:
-    """Directions ``Δ_k`` (p, 4, 4) in which a conjugation changes ``generator`` (4, 4), each by about one
-    unit.
+    """Directions ``Δ_k`` (p, 4, 4) in which conjugation changes ``generator`` (4, 4), each by about one unit.
 
     Orthogonal complement of the commutant of the generator in the stratum's algebra; p as in ``CHART_SIZE``.
     """
@@ -76,12 +75,10 @@ def generator_basis(generator: FloatArray, kind: Kind, stratum: Stratum) -> Floa
 
 
 def conjugation(basis: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Group element ``T(x)`` (4, 4) of a chart and its left-trivialised derivatives ``dT/dx_k T⁻¹`` (p, 4,
-    4).
+    """Group element ``T(x)`` (4, 4) of a chart and its left-trivialised derivatives ``dT/dx_k T⁻¹`` (p, 4, 4).
 
-    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)``: it stays in GL(4), in the affine and in the
-    Euclidean group, and ``dT T⁻¹ = (I - Δ/2)⁻¹
-    dΔ (I + Δ/2)⁻¹``.
+    Cayley's map ``(I - Δ/2)⁻¹ (I + Δ/2)`` stays in GL(4), in the affine and in the Euclidean group, and
+    ``dT T⁻¹ = (I - Δ/2)⁻¹ dΔ (I + Δ/2)⁻¹``.
     """
     half = 0.5 * np.einsum("p,pij->ij", x, basis)
     left = np.linalg.inv(np.eye(4) - half)
@@ -98,9 +95,9 @@ def exponentials(generators: FloatArray, kinds: tuple[Kind, ...], q: FloatArray)
 def camera_basis(matrix: FloatArray, role: Literal["right", "other", "left_metric"], stratum: Stratum) -> FloatArray:
     """Directions (p, 3, 4) of a camera ``matrix`` (3, 4) without gauge freedoms.
 
-    ``other``: all but the matrix's own scale (11). ``right``: in addition without what a change of frame that
-    keeps the left camera does: 4 freedoms in the projective (7 left), 1 in the affine and metric strata (10
-    left). ``left_metric``: the five entries of ``K`` in ``K [I | 0]``.
+    ``other``: all but the matrix's scale (11). ``right``: in addition without changes of frame that keep the left
+    camera: 4 freedoms in the projective stratum (7 remain), 1 in the affine and metric strata (10 remain).
+    ``left_metric``: the five entries of ``K`` in ``K [I | 0]``.
     """
     if role == "left_metric":
         basis = np.zeros((5, 3, 4))
@@ -118,22 +115,20 @@ def camera_basis(matrix: FloatArray, role: Literal["right", "other", "left_metri
 
 
 def lens_basis(model: LensModel) -> FloatArray:
-    """Directions (p, 7) of a lens (k, cu, cv, r0, k2, p1, p2) that are free: see `LensModel`."""
+    """Free directions (p, 7) of a lens (k, cu, cv, r0, k2, p1, p2): see `LensModel`."""
     free = {"none": 0, "radial": 1, "radial_centre": 3, "brown": 6}[model]
     return np.asarray(np.eye(7)[list(LENS_PARAMETERS[:free])])
 
 
 def lens_model_of(lenses: FloatArray) -> LensModel:
-    """What of ``lenses`` (c, 4 or 7) was free in the fit that they come from."""
+    """The lens model of the fit that returned ``lenses`` (c, 4 or 7)."""
     if lenses[:, 4:].any():
         return "brown"
     return "radial_centre" if lenses[:, 0].any() else "none"
 
 
 def point_bases(points: FloatArray, stratum: Stratum) -> FloatArray:
-    """Directions (m, 3, 4) of points (m, 4): all but their scale, or the three finite coordinates of affine
-    strata.
-    """
+    """Directions (m, 3, 4) of points (m, 4): all but their scale, or the three finite coordinates if affine."""
     if stratum != "projective":
         return np.tile(np.eye(4)[:3], (len(points), 1, 1))
     return np.asarray(np.linalg.svd(points[:, None, :])[2][:, 1:])

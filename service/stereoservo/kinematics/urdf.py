@@ -17,20 +17,20 @@ from stereoservo.messages.known_length import KnownLength
 from stereoservo.numerics.arrays import FloatArray
 
 SQUARE = np.radians(2.0)
-"""Largest deviation from right angles of three slides that are taken for the axes of a base."""
+"""Largest deviation from right angles [rad] of three prismatic joints that count as the axes of a base."""
 UNBOUNDED = 1e3
-"""Limit of a slide whose limits are not stated [m]."""
+"""Limit of a prismatic joint without stated limits [m]."""
 FASTEST = 1.0
-"""Velocity of a joint whose limits are not stated [m/s, rad/s]: the format asks for one."""
+"""Velocity of a joint without stated limits [m/s, rad/s]: the format requires one."""
 
 
 @dataclass(frozen=True, eq=False)
 class MetricArm:
     """A model in metres, all joints at position 0, in its root frame.
 
-    ``directions`` (n, 3) of the axes; ``origins`` (n, 3) on them [m]; ``scales`` (n,): URDF position of a joint over
-    the model's, 1 of revolute ones; ``markers`` (m, 3) [m]; ``cameras`` (c, 4, 4): root from optical frame.
-    ``carried``: what the last link carries, markers or cameras; the others stand.
+    ``directions`` (n, 3) of the axes; ``origins`` (n, 3) on them [m]; ``scales`` (n,): URDF position of a joint divided
+    by the model's, 1 for revolute joints; ``markers`` (m, 3) [m]; ``cameras`` (c, 4, 4): root from optical frame.
+    ``carried``: what the last link carries, ``"markers"`` or ``"cameras"``; the others are static.
     """
 
     directions: FloatArray
@@ -44,10 +44,10 @@ class MetricArm:
 def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
     """The parts of a metric ``model`` in its root frame.
 
-    The root is the base frame of arms that begin with three slides square to each other (gantries, and arms that take
-    Cartesian velocities: there it is the robot's own base): axes along them, origin where the turns begin. Of others z
-    is along the first axis, x towards the first axis of another direction. Raises ReadOutError (``stratum``,
-    ``unknown_name``, ``length``), GeometryError.
+    If the arm begins with three orthogonal prismatic joints (gantries, and arms with Cartesian velocity commands, where
+    it is the robot's own base), the root is the base frame: axes along them, origin where the rotations begin. For
+    other arms, z is along the first axis, x towards the first axis of another direction. Raises ReadOutError
+    (``stratum``, ``unknown_name``, ``length``), GeometryError.
     """
     metres = metres_per_length(model, known)
     parts = framed(model)
@@ -67,7 +67,7 @@ def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
     origins = np.empty((len(parts.kinds), 3))
     place = np.zeros(3)
     for j, kind in enumerate(parts.kinds):
-        if kind == "revolute":  # a slide has no place: it stays at the joint before
+        if kind == "revolute":  # a prismatic joint has no position: that of the previous joint is used
             place = metres * R.T @ (axes.points[j] - origin)
             place = place - axes.directions[j] @ R * (place @ (R.T @ axes.directions[j]))
         origins[j] = place
@@ -99,7 +99,7 @@ def urdf_text(model: CellModel, arm: MetricArm, name: str, limits: Mapping[str, 
     """URDF: links ``base``, ``link_1`` … ``link_n``, ``marker_ID``, ``camera_NAME`` (optical frames).
 
     ``limits`` by joint: lowest, highest position, velocity [rad or m, s] in the model's units; revolute joints without
-    them are ``continuous``.
+    limits are ``continuous``.
     """
     lines = [f"<robot name={quoteattr(name)}>", '  <link name="base"/>']
     before, link = np.zeros(3), "base"

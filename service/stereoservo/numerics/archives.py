@@ -1,4 +1,4 @@
-"""Reading of ``.npz`` archives that nobody vouches for."""
+"""Reading of ``.npz`` archives from untrusted sources."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 MOST_EXPANSION = 1100
-"""Bytes that a byte of deflated data can become, and some."""
+"""Bound of the expansion ratio of deflated data."""
 
 
 def read_archive(data: bytes, limit: int) -> dict[str, npt.NDArray[Any]]:
-    """Arrays of an ``.npz`` archive by name. Stated sizes are compared with the bytes that there are, and with
-    ``limit`` for all of them, before anything is allocated; objects are not read.
+    """Arrays of an ``.npz`` archive by name. Before allocation, the stated sizes are compared with the available bytes,
+    and their sum with ``limit`` [bytes]; object arrays are not read.
 
-    Raises ValueError, and whatever `zipfile` raises for a damaged archive.
+    Raises ValueError, and the exceptions of `zipfile` for a damaged archive.
     """
     if not data.startswith(b"PK"):
         raise ValueError("it is no .npz archive")

@@ -13,4 +13,4 @@ BoolArray = npt.NDArray[np.bool_]
 KindArray = npt.NDArray[np.uint8]
 ImageArray = npt.NDArray[np.uint8]
 Record = Any
-"""An array (1,) of a structured type: `core.block.BLOCK` and its like."""
+"""An array (1,) of a structured type such as `core.block.BLOCK`."""

@@ -1,5 +1,5 @@
 """Decorators that compile functions with numba as kernels, cached on disk, those of the control loop without fastmath;
-what this process has compiled, and a log of it.
+list and log of the kernels that this process has compiled.
 """
 
 from __future__ import annotations
@@ -21,22 +21,21 @@ from stereoservo.numerics.kernel_cache import KernelCache
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 Fields = tuple[Any, ...]
-"""The fields of a record in a plain tuple, as a kernel takes them that Python calls in each step or frame.
+"""The fields of a record as a plain tuple: argument type of kernels that Python calls in each step or frame.
 
-numba looks up the type of a NamedTuple anew at every call from Python, for more than a microsecond; that of a plain
-tuple by what is in it, for a tenth of that. The kernel unpacks the fields in their order, or makes the record of them:
-``View(*view)``.
+At every call from Python, numba's type lookup takes more than a microsecond for a NamedTuple, and a tenth of that for a
+plain tuple. The kernel unpacks the fields in order, or makes the record from them: ``View(*view)``.
 """
 
 LOG_VARIABLE = "STEREOSERVO_COMPILE_LOG"
-"""Environment variable: a file to which every process appends a line of JSON for each signature that it compiles."""
+"""Environment variable: file to which every process appends one line of JSON for each signature that it compiles."""
 
 KERNELS: dict[tuple[str, str], Any] = {}
 """The kernels that this process has imported, by module and name."""
 
 
 class Overload(NamedTuple):
-    """One compiled signature of a kernel; pickles."""
+    """One compiled signature of a kernel; can be pickled."""
 
     module: str
     name: str
@@ -47,26 +46,24 @@ def kernel(function: _F) -> _F:
     """Compile for the loop: cached on disk, exact arithmetic, no Python objects.
 
     A kernel that calls another one with a literal (``solve(A, 0)``) calls the same compiled code as with any other
-    integer; numba's own way compiles it once more for each literal.
+    integer; by default, numba compiles another version for each literal.
 
-    A cached kernel is renewed when its own source changes or that of a kernel which it calls. Where no cache
-    directory is writable the kernel is compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` names a directory.
+    A cached kernel is recompiled when its source or that of a kernel that it calls has changed. If no cache directory
+    is writable, the kernel is compiled at every start, with a warning; ``NUMBA_CACHE_DIR`` sets a directory.
     """
     return _compile(function)
 
 
 def inlined_kernel(function: _F) -> _F:
-    """A :func:`kernel` that is compiled into each kernel that calls it: a part of an inner loop, where the call itself
-    would cost.
-    """
+    """A :func:`kernel` that is compiled into each kernel that calls it: for inner loops with relevant call overhead."""
     return _compile(function, inline="always")
 
 
 def reassociating_kernel(function: _F) -> _F:
     """A :func:`kernel` whose sums may be taken in any order, so that a loop over pixels uses vector instructions.
 
-    For detectors alone, which stand outside of the replayed core: its bits depend on the processor. NaN and infinity
-    are what they are elsewhere.
+    For detectors only, which are not part of the replayed core: the result depends on the processor in its last bits.
+    NaN and infinity are handled as in other kernels.
     """
     return _compile(function, fastmath={"reassoc", "nsz", "contract"})
 
@@ -84,7 +81,7 @@ def overloads() -> Iterator[Overload]:
 
 
 def load(wanted: Iterable[Overload]) -> Iterator[None]:
-    """Load kernels from the cache, one a step of the iterator; what is not in the cache is compiled."""
+    """Load kernels from the cache, one per step of the iterator; kernels that are not in the cache are compiled."""
     for overload in wanted:
         key = (overload.module, overload.name)
         if key not in KERNELS:
@@ -97,7 +94,7 @@ def load(wanted: Iterable[Overload]) -> Iterator[None]:
 def _compile(function: _F, **more: Any) -> _F:
     options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **more}
     compiled = numba.njit(**options)(function)
-    if compiled is not function:  # with NUMBA_DISABLE_JIT it is
+    if compiled is not function:  # equal with NUMBA_DISABLE_JIT
         try:
             compiled._cache = KernelCache(function)
         except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
@@ -108,7 +105,7 @@ def _compile(function: _F, **more: Any) -> _F:
 
 
 def _forget_literals(dispatcher: Any) -> None:
-    """Have calls by other kernels looked up by the types of their arguments, not by the values of literals."""
+    """Make the lookup of calls by other kernels depend only on the argument types, not on the values of literals."""
     template, unliteral = dispatcher.get_call_template, cast(Any, types).unliteral
 
     def get_call_template(args: Any, kws: Any) -> Any:
@@ -121,8 +118,8 @@ def _forget_literals(dispatcher: Any) -> None:
 
 
 def tell_compiled(tell: Callable[[int], None]) -> None:
-    """Have this process call ``tell`` with the number of signatures that it holds, compiled or loaded, whenever it has
-    compiled another kernel.
+    """Register ``tell``, which is called after each compilation of a kernel with the number of signatures that this
+    process has compiled or loaded.
     """
     event.register("numba:compile", _Counting(tell))
 
@@ -132,7 +129,7 @@ class _Counting(event.Listener):  # type: ignore[misc]
         self._tell = tell
 
     def on_start(self, event: Any) -> None:
-        """Nothing: a kernel counts when it is compiled."""
+        """Do nothing: a kernel is counted when it is compiled."""
 
     def on_end(self, event: Any) -> None:
         function = event.data["dispatcher"].py_func
@@ -141,8 +138,8 @@ class _Counting(event.Listener):  # type: ignore[misc]
 
 
 class _CompileLog(event.Listener):  # type: ignore[misc]
-    """Appends to ``path``: process, kernel, types of the arguments, and CPU seconds of this thread, those of the
-    kernels compiled meanwhile apart; at the end of the process its CPU seconds in all.
+    """Appends to ``path``: process, kernel, argument types, and CPU seconds of this thread, without those of the
+    kernels compiled within; at the end of the process its total CPU seconds.
     """
 
     def __init__(self, path: str) -> None:
@@ -169,7 +166,7 @@ class _CompileLog(event.Listener):  # type: ignore[misc]
         )
 
     def _append(self, line: dict[str, Any]) -> None:
-        import json  # for this alone: a servo process has none
+        import json  # imported only here: a servo process does not need it
 
         process = os.path.basename(sys.argv[0]).removesuffix(".py")
         with open(self._path, "a", encoding="utf-8") as file:

@@ -1,5 +1,5 @@
-"""The cache of a kernel's machine code: valid for the sources of the kernel and of all that it calls, and filled
-beforehand where the distribution ``stereoservo-kernels`` is installed.
+"""Cache of the machine code of kernels: valid for the sources of a kernel and of all that it calls, and prefilled if
+the distribution ``stereoservo-kernels`` is installed.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ from numba.core.caching import FunctionCache, IndexDataCacheFile
 SHIPPED = "stereoservo_kernels"
 """The package of that distribution: a folder for each package that has kernels, with the files of numba's cache."""
 LEVELS = {"haswell": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"), "generic": ()}
-"""Processors that its code is compiled for, the best first, with what a processor must have to run it."""
+"""Processor levels for which its code is compiled, the best first, with the required processor features."""
 
 
 class KernelCache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of one kernel. Raises RuntimeError where no directory for it can be written.
+    """numba's cache of one kernel. Raises RuntimeError if no cache directory is writable.
 
-    numba renews a kernel when its own file has changed. Here the key holds the sources of the kernels that it calls as
-    well, and the constants that are compiled into them: after an upgrade, or an edit, nothing old is run.
+    numba recompiles a kernel when its own file has changed. Here the key also contains the sources of the kernels that
+    it calls, and the constants that are compiled into them: after an upgrade or an edit, no outdated code is run.
     """
 
     def __init__(self, py_func: Any) -> None:
         super().__init__(py_func)
-        file_hash(inspect.getfile(py_func))  # as imported: an upgrade may change the file before this is compiled
+        file_hash(inspect.getfile(py_func))  # as imported: an upgrade may change the file before compilation
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
         return (*super()._index_key(sig, codegen), dependencies(self._py_func))
@@ -60,7 +60,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
             self._cache_file._load_index()
         except OSError:
             raise
-        except Exception:  # damaged, or of another version, with types of a module that is gone
+        except Exception:  # damaged, or of another version, with types of a module that no longer exists
             self._cache_file.flush()
         super()._save_overload(sig, data)
 
@@ -83,14 +83,14 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
 
 @functools.cache
 def levels_here() -> tuple[str, ...]:
-    """Of `LEVELS` those whose code runs on this processor."""
+    """The `LEVELS` whose code runs on this processor."""
     here = llvmlite.binding.get_host_cpu_features()
     return tuple(level for level, needs in LEVELS.items() if all(here.get(need) for need in needs))
 
 
 @functools.cache
 def shipped_folder() -> Path | None:
-    """The folder of compiled kernels that are installed; None without them."""
+    """Folder of the installed compiled kernels; None if there are none."""
     spec = importlib.util.find_spec(SHIPPED)
     if spec is None or not spec.submodule_search_locations:
         return None
@@ -98,8 +98,8 @@ def shipped_folder() -> Path | None:
 
 
 def _without_module(loaded: Any) -> Any:
-    """A kernel from the cache without its parsed LLVM module, which only the compilation of a caller needs; that gets
-    it anew from the bitcode. A servo process, which compiles nothing, needs a quarter less memory.
+    """A kernel from the cache without its parsed LLVM module. Only the compilation of a caller needs the module, and
+    then parses it again from the bitcode. A servo process, which compiles nothing, needs a quarter less memory.
     """
     library = loaded.library
     if (module := getattr(library, "_shared_module", None)) is not None:
@@ -111,8 +111,8 @@ def _without_module(loaded: Any) -> Any:
 
 
 def dependencies(function: Callable[..., Any]) -> str:
-    """Hash of what a kernel is compiled of besides its own code: the source files of all kernels, functions and classes
-    of its distribution that it reaches by name, the constants, and the defaults of arguments.
+    """Hash of the dependencies of a kernel's code: the source files of all kernels, functions and classes of its
+    distribution that it reaches by name, the constants, and the defaults of arguments.
     """
     found: set[str] = set()
     seen: set[Callable[..., Any]] = set()
@@ -129,7 +129,7 @@ def dependencies(function: Callable[..., Any]) -> str:
 
 @functools.cache
 def _named_by(function: FunctionType) -> tuple[frozenset[str], tuple[FunctionType, ...]]:
-    """A text for its own source file and each constant that a function names; and the functions that it names."""
+    """Texts for a function's source file and each constant that it references; and the functions that it references."""
     texts, called = {file_hash(inspect.getfile(function))}, []
     root = function.__module__.partition(".")[0]
     for name, value in _values(function, root):
@@ -147,8 +147,8 @@ def _named_by(function: FunctionType) -> tuple[frozenset[str], tuple[FunctionTyp
 
 
 def _values(function: FunctionType, root: str) -> Iterator[tuple[str, Any]]:
-    """What a function refers to, with its name: globals, variables of the functions around it, defaults of arguments,
-    and attributes of its distribution's modules; of a kernel its Python function.
+    """Names and values that a function references: globals, variables of enclosing functions, defaults of arguments,
+    and attributes of its distribution's modules; for a kernel, its Python function.
     """
     names = sorted(set(_names(function.__code__)))
     around = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
@@ -166,7 +166,7 @@ def _values(function: FunctionType, root: str) -> Iterator[tuple[str, Any]]:
 
 
 def _foreign(value: Any, root: str) -> bool:
-    """Whether a function, class or module belongs to a distribution that has a version of its own: numba, numpy."""
+    """Whether a function, class or module belongs to another distribution with its own version: numba, numpy."""
     name = value.__name__ if isinstance(value, ModuleType) else value.__module__
     return not str(name).startswith((root.partition("_")[0] or root, "stereoservo"))
 
@@ -180,7 +180,7 @@ def _names(code: CodeType) -> Iterator[str]:
 
 @functools.cache
 def file_hash(path: str) -> str:
-    """SHA-256 of a file's content; of its name alone where it cannot be read (code without a file)."""
+    """SHA-256 of a file's content; of its name only if the file cannot be read (code without a file)."""
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError:

@@ -1,7 +1,7 @@
 """Numba kernels of small dense linear algebra without BLAS, LAPACK or fastmath: Cholesky, normal equations, damped
 least squares, orthonormal rows, null directions, singular vectors.
 
-Explicit loops in a fixed order: the same input gives the same bits on one machine. Arrays are float64.
+Explicit loops in a fixed order: the same input gives bitwise the same result on one machine. Arrays are float64.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ PIVOT_TOLERANCE = 1e-14
 SWEEPS = 40
 ORTHOGONAL = 1e-15
 NEGLIGIBLE = 1e-17
-"""One-sided Jacobi: columns are orthogonal below this cosine; and a column below this share of the matrix is
+"""One-sided Jacobi: columns are orthogonal below this cosine; columns below this fraction of the matrix are
 rounding.
 """
 
 
 class NormalSystem(NamedTuple):
-    """``N x = b``: ``N`` (n, n) symmetric, of which the lower triangle may be all, and ``b`` (n,)."""
+    """``N x = b``: ``N`` (n, n) symmetric, possibly with only the lower triangle filled, and ``b`` (n,)."""
 
     N: FloatArray
     b: FloatArray
@@ -36,7 +36,7 @@ class NormalSystem(NamedTuple):
 def cholesky_solve(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
     """Solve ``N x = b`` for symmetric positive ``N`` (n, n), which is overwritten by its Cholesky factor.
 
-    Returns the smallest pivot over the largest diagonal; 0 (and ``x = 0``) where ``N`` is singular or not
+    Returns the smallest pivot divided by the largest diagonal element; 0 (and ``x = 0``) if ``N`` is singular or not
     finite.
     """
     n = b.shape[0]
@@ -91,7 +91,7 @@ def factor_solve(L: FloatArray, b: FloatArray, x: FloatArray) -> None:
 def add_equation(row: FloatArray, error: float, weight: float, N: FloatArray, b: FloatArray) -> None:
     """Add one equation ``row·x = error`` of squared weight ``weight`` to the normal equations ``N x = b``.
 
-    ``row`` (n,); of ``N`` (n, n) the lower triangle is added to.
+    ``row`` (n,); only the lower triangle of ``N`` (n, n) is updated.
     """
     for i in range(b.shape[0]):
         weighted = weight * row[i]
@@ -125,9 +125,9 @@ def damped_solve(N: FloatArray, b: FloatArray, damping: float, x: FloatArray) ->
 def damped_least_squares(J: FloatArray, e: FloatArray, weights: FloatArray, damping: float) -> tuple[FloatArray, float]:
     """``x`` (n,) of least ``Σ w²(Jx − e)² + damping·d·|x|²``, ``d`` the largest diagonal of ``JᵀW²J``.
 
-    ``J`` (r, n), ``e`` (r,), ``weights`` (r,) = 1/sigma, 0 where missing (the row is then not read). Returns
-    ``x`` and the conditioning: the smallest Cholesky pivot of the damped normal matrix over its largest
-    diagonal, 0 (with ``x = 0``) where it is singular.
+    ``J`` (r, n), ``e`` (r,), ``weights`` (r,) = 1/sigma, 0 where missing (the row is then not read). Returns ``x`` and
+    the conditioning: the smallest Cholesky pivot of the damped normal matrix divided by its largest diagonal element, 0
+    (with ``x = 0``) if it is singular.
     """
     rows, n = J.shape
     N = np.zeros((n, n))
@@ -144,9 +144,9 @@ def damped_least_squares(J: FloatArray, e: FloatArray, weights: FloatArray, damp
 
 @kernel
 def right_singular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Right singular vectors as columns (n, n) and singular values (n,), descending, of ``A`` (r, n), r any.
+    """Right singular vectors as columns (n, n) and singular values (n,), descending, of ``A`` (r, n), for any r.
 
-    One-sided Jacobi: relative accuracy also of small values, no LAPACK. Vectors are unique up to sign.
+    One-sided Jacobi: small values are relatively accurate, too; no LAPACK. Vectors are unique up to sign.
     """
     rows, n = A.shape
     U = A.copy()
@@ -207,10 +207,9 @@ def right_singular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 @kernel
 def null_direction(A: FloatArray) -> tuple[FloatArray, float, float, float]:
-    """Unit ``x`` (n,) of least ``|A x|`` for ``A`` (r, n), and the smallest, second-smallest, largest
-    singular value.
+    """Unit ``x`` (n,) of least ``|A x|`` for ``A`` (r, n), and the smallest, second-smallest, largest singular value.
 
-    With one column the three values are one.
+    With one column the three values are equal.
     """
     V, values = right_singular(A)
     n = values.shape[0]
@@ -224,12 +223,12 @@ def null_direction(A: FloatArray) -> tuple[FloatArray, float, float, float]:
 
 INVERSE_ITERATIONS = 8
 SETTLED = 1e-16
-"""Of a null direction: what another round of inverse iteration would change."""
+"""Change of a null direction in one more iteration below which inverse iteration has converged."""
 
 
 @kernel
 def dot_of_rows(A: FloatArray, i: int, B: FloatArray, k: int) -> float:
-    """``A[i]·B[k]`` of rows whose length is a multiple of four, as four sums."""
+    """``A[i]·B[k]`` of rows whose length is a multiple of four, as four partial sums."""
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     for c in range(0, A.shape[1], 4):
         s0 += A[i, c] * B[k, c]
@@ -241,8 +240,8 @@ def dot_of_rows(A: FloatArray, i: int, B: FloatArray, k: int) -> float:
 
 @kernel
 def invert_upper(R: FloatArray, n: int, W: FloatArray) -> float:
-    """Inverse of the leading (n, n) of an upper triangular ``R`` into ``W``, zeros below; its squared Frobenius norm,
-    infinite where ``R`` has no inverse.
+    """Inverse of the leading (n, n) of an upper triangular ``R`` into ``W``, zeros below; returns its squared Frobenius
+    norm, infinite if ``R`` has no inverse.
     """
     size = 0.0
     for k in range(n):
@@ -264,11 +263,11 @@ def invert_upper(R: FloatArray, n: int, W: FloatArray) -> float:
 
 @kernel
 def orthonormal_rows(A: FloatArray, Q: FloatArray, W: FloatArray) -> float:
-    """Orthonormal ``Q = Wᵀ A`` (n, m) of the rows of ``A`` (n, m), ``W`` (n, n) upper triangular, by Gram and Schmidt;
-    a lower bound, within a factor n, of the smallest over the largest singular value of ``A``: 0 where rows depend on
-    one another.
+    """Orthonormal ``Q = Wᵀ A`` (n, m) of the rows of ``A`` (n, m), ``W`` (n, n) upper triangular, by Gram-Schmidt;
+    returns a lower bound, within a factor n, of the smallest over the largest singular value of ``A``: 0 if the rows
+    are linearly dependent.
 
-    ``m`` is a multiple of four. ``Q`` is orthonormal to rounding over the bound.
+    ``m`` is a multiple of four. ``Q`` is orthonormal up to rounding divided by the bound.
     """
     n, m = A.shape
     R = np.zeros((n, n))
@@ -298,8 +297,8 @@ def left_null_direction(A: FloatArray, x: FloatArray) -> tuple[float, float, flo
     """Unit ``x`` (n,) of least ``|xᵀ A|`` for ``A`` (n, m), n >= 2, which is overwritten; bounds of its singular
     values: the smallest is at most the first, the second-smallest at least the second, the largest at most the third.
 
-    By Gram and Schmidt with pivoting, then inverse iteration. The second is 0, and ``x`` unknown, where that does not
-    tell the direction: several are null, or nearly. ``m`` is a multiple of four.
+    Gram-Schmidt with pivoting, then inverse iteration. The second bound is 0, and ``x`` undefined, if the direction is
+    not determined: several directions are null, or nearly. ``m`` is a multiple of four.
     """
     n, m = A.shape
     R, W = np.zeros((n, n)), np.empty((n, n))
@@ -356,8 +355,8 @@ def left_null_direction(A: FloatArray, x: FloatArray) -> tuple[float, float, flo
 
 @kernel
 def _by_inverse_iteration(R: FloatArray, y: FloatArray, ratio: float) -> bool:
-    """Refine the unit ``y`` (n,) of least ``|R y|``; ``ratio``: a bound of the smallest singular value over the second.
-    False where that takes too long.
+    """Refine the unit ``y`` (n,) of least ``|R y|``; ``ratio``: a bound of the smallest singular value divided by the
+    second. False if it does not converge in time.
     """
     n = y.shape[0]
     if ratio <= SETTLED:

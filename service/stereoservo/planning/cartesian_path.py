@@ -1,8 +1,8 @@
 """Cartesian path of a body: displacement (4, 4) at a path parameter in [0, 1], composed of the translation, hinge and
-planar turn of a decomposition made beforehand, each with its own profile (thesis 7.4.3).
+planar rotation of a given decomposition, each with its own profile (thesis 7.4.3).
 
-``H_c(σ) = exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p)``: the translation leftmost, so that no rotation changes its
-line; the hinge second, so that the planar rotation changes no plane.
+``H_c(σ) = exp(μ_t τ Ĥ_t) exp(μ_r θ_r Ĥ_r) exp(μ_p θ_p Ĥ_p)``: the translation is leftmost, so no rotation changes its
+line; the hinge is second, so the planar rotation does not change the plane.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from stereoservo.planning.three_point_decomposition import ComponentStatus, Deco
 
 
 class IncompleteDecompositionError(ValueError):
-    """A component of the path cannot be made by the arm. ``component``: translation, hinge or planar."""
+    """The arm cannot make a component of the path. ``component``: translation, hinge or planar."""
 
     def __init__(self, component: str, detail: str) -> None:
         super().__init__(f"the {component} of the way is missing: {detail}")
@@ -57,7 +57,7 @@ class CartesianPath:
 
 
 def cartesian_path(decomposition: Decomposition, profile: Profile = "linear") -> CartesianPath:
-    """The family of Cartesian trajectories of a decomposition. Raises IncompleteDecompositionError."""
+    """The Cartesian path of a decomposition with a profile. Raises IncompleteDecompositionError."""
     for name in ("translation", "hinge", "planar"):
         component = getattr(decomposition, name)
         if component.status == ComponentStatus.NOT_REACHABLE:

@@ -1,15 +1,15 @@
-"""Frame in which the motions of an uncalibrated arm are Euclidean, from its joint operators and the plane at infinity;
-and the pose at each parameter of a path in it.
+"""Frame in which the motions of an uncalibrated arm are Euclidean, computed from its joint operators and the plane at
+infinity; and the pose at each parameter of a path in it.
 
-The operators leave the plane at infinity and, in it, one quadratic form: ``SᵀQ + QS = 0`` for their action ``S`` on
-displacements (5.59). Its square root makes the frame. Nothing else is known or needed: the length of its unit is chosen
-(the cameras are one away from the centre), and for an arm that turns about one direction only, or not at all, any frame
-that its motions agree with serves, since the others are out of its reach.
+The operators preserve the plane at infinity and, in it, one quadratic form: ``SᵀQ + QS = 0`` for their action ``S`` on
+displacements (5.59). The square root of the form defines the frame. Its unit of length is chosen: the cameras are at
+distance one from the centre. For an arm that rotates about one direction only, or not at all, the form is not unique;
+any solution may be used, because the arm cannot make motions that distinguish them.
 
 A path of a body is a hinge rotation, a planar one and a translation of its centre, each with a profile ``μ(σ)``,
-monotone from 0 to 1 on [0, 1] (7.26, 7.4.3). Linear: at an even pace. Exponential: as a feedback loop does,
+monotone from 0 to 1 on [0, 1] (7.26, 7.4.3). Linear: constant rate. Exponential: as a feedback loop converges,
 ``(1 − e^{−kσ})/(1 − e^{−k})``, scaled to end at 1 (errata). First and last: the component moves in the first or in the
-last seven tenths; in the middle one hands over to the other, slowly enough for accelerations. Kernels, for the loop.
+last seven tenths; in the middle the two overlap, which limits accelerations. Kernels, for the loop.
 """
 
 from __future__ import annotations
@@ -24,29 +24,31 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import cholesky_solve
 
 OPERATOR_WEIGHT = 1e-3
-"""Of the operators beside the heights in the plane at infinity: heights are exact by convention, operators measured."""
+"""Weight of the operators relative to the heights in the estimate of the plane at infinity: heights are exact by
+convention, operators are measured.
+"""
 PRISMATIC = 1e-12
-"""Square of the turn relative to that of the operator's block, below which a joint does not turn."""
+"""Squared rotation rate, relative to the operator block's squared norm, below which a joint counts as prismatic."""
 AVERAGED = 5
-"""Angles over which a form is averaged: it is of second degree in sine and cosine, so that five are exact."""
+"""Number of angles over which a form is averaged: it is of second degree in sine and cosine, so five are exact."""
 INVERSE_ITERATIONS = 3
 SHIFT = 1e-10
-"""Relative, of the inverse iteration."""
+"""Relative shift of the inverse iteration."""
 
 LINEAR, FIRST, LAST, EXPONENTIAL = 0.0, 1.0, 2.0, 3.0
-"""Shapes of one component."""
+"""Profile shapes of one component."""
 
 DECAY = 4.0
-"""How many time constants an exponential motion lasts: what is left of it when linear scaling ends it is 2 %."""
+"""Duration of an exponential motion in time constants: the remainder at its end, removed by linear scaling, is 2 %."""
 HANDS_OVER, ENDS = 0.3, 0.7
-"""Where a component that goes first begins to slow down, and has ended."""
+"""Path parameters at which a component that moves first begins to slow down, and ends."""
 NUMBERS = 17
-"""That describe a path: hinge (4), planar rotation (4), translation (3), bend (3), profiles of the three (3)."""
+"""Numbers of a path: hinge (4), planar rotation (4), translation (3), bend (3), profiles of the three (3)."""
 
 
 @kernel
 def plane_at_infinity(operators: FloatArray, points: FloatArray) -> FloatArray:
-    """``a∞`` (4,) with ``a∞ᵀM = 1`` for ``points`` (k, 4) and ``a∞ᵀĤ_j = 0``; zeros where neither determines it."""
+    """``a∞`` (4,) with ``a∞ᵀM = 1`` for ``points`` (k, 4) and ``a∞ᵀĤ_j = 0``; zeros if neither determines it."""
     N = np.zeros((4, 4))
     b = np.zeros(4)
     for p in range(points.shape[0]):
@@ -93,7 +95,9 @@ def conjugate_all(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
 
 @kernel
 def average_over_turns(form: FloatArray, generator: FloatArray) -> None:
-    """A quadratic ``form`` (k, k), in place, averaged over all turns by a ``generator`` (k, k) of eigenvalues 0, ±i."""
+    """Average a quadratic ``form`` (k, k), in place, over the rotations by a ``generator`` (k, k) of eigenvalues 0,
+    ±i.
+    """
     size = form.shape[0]
     square, turned = np.zeros((size, size)), np.empty((size, size))
     product, total = np.empty((size, size)), np.zeros((size, size))
@@ -128,7 +132,7 @@ def _multiply_into(A: FloatArray, B: FloatArray, out: FloatArray) -> None:
 
 @kernel
 def _averaged_form(blocks: FloatArray) -> FloatArray:
-    """A positive form (3, 3), averaged over the turns of each block (k, 3, 3) of eigenvalues 0, ±i in sequence."""
+    """A positive form (3, 3), averaged over the rotations of each block (k, 3, 3) of eigenvalues 0, ±i in sequence."""
     Q = np.eye(3)
     for j in range(blocks.shape[0]):
         average_over_turns(Q, blocks[j])
@@ -186,7 +190,7 @@ def _invariant_form(blocks: FloatArray, start: FloatArray) -> FloatArray:
 
 @kernel
 def _root(Q: FloatArray, L: FloatArray) -> bool:
-    """``Q = L Lᵀ`` for (3, 3); False where it is not positive."""
+    """Cholesky factor ``Q = L Lᵀ`` (3, 3), written into ``L``; False if ``Q`` is not positive definite."""
     for j in range(3):
         for i in range(j, 3):
             s = Q[i, j]
@@ -203,10 +207,10 @@ def _root(Q: FloatArray, L: FloatArray) -> bool:
 
 @kernel
 def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, eyes: FloatArray) -> FloatArray:
-    """``W`` (4, 4): ``W (x, y, z, 1)`` is a point of height 1, ``W (0, 0, 0, 1)`` the ``centre`` (4,).
+    """The motion frame ``W`` (4, 4): ``W (x, y, z, 1)`` is a point of height 1, ``W (0, 0, 0, 1)`` the ``centre`` (4,).
 
     In its coordinates the ``operators`` (n, 4, 4) are Euclidean twists, and the mean distance of ``eyes`` (c, 4) from
-    the centre is 1. All NaN where ``plane`` (4,) is no plane.
+    the centre is 1. All NaN if ``plane`` (4,) is not a plane.
     """
     pivot = 0
     for i in range(1, 4):
@@ -292,9 +296,9 @@ def turn(axis: FloatArray, angle: float) -> FloatArray:
 
 @kernel
 def turn_between(X: FloatArray, Y: FloatArray) -> FloatArray:
-    """Axis and angle (4,) of the rotation that takes the spread of points ``X`` (m, 3) to that of ``Y`` best (Horn).
+    """Axis and angle (4,) of the least-squares rotation from centred points ``X`` (m, 3) to ``Y`` (m, 3) (Horn).
 
-    Angle in [0, π] [rad]; at 0 the axis is the third of the frame. At π it may have either sense.
+    Angle in [0, π] [rad]; at 0 the axis is the third of the frame. At π its sign is arbitrary.
     """
     m = X.shape[0]
     mean_x, mean_y = np.zeros(3), np.zeros(3)
@@ -347,7 +351,7 @@ def _first(sigma: float) -> float:
 
 @kernel
 def progress(shape: float, sigma: float) -> float:
-    """``μ(σ)`` of one component."""
+    """Profile ``μ(σ)`` of one component."""
     sigma = min(1.0, max(0.0, sigma))
     if shape == FIRST:
         return _first(sigma)
@@ -360,7 +364,7 @@ def progress(shape: float, sigma: float) -> float:
 
 @kernel
 def pose_on_path(path: FloatArray, path_parameter: float) -> FloatArray:
-    """Displacement (4, 4) from the present pose, in the motion frame."""
+    """Displacement (4, 4) from the current pose, in the motion frame."""
     R_r = turn(path[0:3], path[3] * progress(path[15], path_parameter))
     R_p = turn(path[4:7], path[7] * progress(path[16], path_parameter))
     along, aside = progress(path[14], path_parameter), 4.0 * path_parameter * (1.0 - path_parameter)

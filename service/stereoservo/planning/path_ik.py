@@ -1,8 +1,8 @@
 """Numba kernels of inverse kinematics along a path of the body, by damped Gauss-Newton steps sample by sample, with
-checks of all limits; and of joints for a goal pose from many start values.
+checks of all limits; and for a goal pose from many start values.
 
-The operators are those at the present joints (Theorem 10), moved along with the arm; so any arm of
-`kinematics.composition` can be used, whatever its number of joints. The self-motion of a redundant arm keeps its joints
+The operators are those at the current joints (Theorem 10), updated as the arm moves; so any arm of
+`kinematics.composition` can be used, with any number of joints. The self-motion of a redundant arm keeps its joints
 away from their limits.
 """
 
@@ -28,30 +28,32 @@ from stereoservo.planning.visibility_constraints import (
 )
 
 ARRIVED = 1e-7
-"""Distance of a point from its place, as a share of the cameras' distance: below a thousandth of a pixel."""
+"""Distance of a point from its required position at which it has arrived, as a fraction of the cameras' distance: below
+a thousandth of a pixel.
+"""
 SETTLED = 1e-6
-"""Largest joint step [rad or frame lengths] at which an arm that cannot follow is as near as it comes."""
+"""Largest joint step [rad or frame lengths] at which an arm that cannot reach the target has converged."""
 ITERATIONS, LENIENT_ITERATIONS = 8, 3
-"""At most, where the arm must arrive, and where it goes as near as it comes."""
+"""Largest number of iterations if the arm must arrive, and if it only needs to come as near as possible."""
 STRIDE, STRIDE_PX = 0.1, 2.0
-"""Joint step of a sample [rad or frame lengths] from which on the midpoint is checked too; its tolerance."""
+"""Joint step of a sample [rad or frame lengths] from which on the midpoint is checked too; tolerance there [px]."""
 DAMPING = 1e-9
-"""Of the normal matrix, relative to its largest diagonal."""
+"""Damping of the normal matrix, relative to its largest diagonal element."""
 BY_MOMENTS = 64
-"""Markers above which a body's normal equations are formed by its moments."""
+"""Number of markers above which the normal equations are formed from the body's moments."""
 LARGEST_STEP = 0.3
-"""Of a joint in one iteration [rad or lengths]: larger ones lie beyond what a linear model says."""
+"""Largest step of a joint in one iteration [rad or frame lengths]: the linear model does not hold for larger ones."""
 SELF_MOTION = 0.08
-"""Share of a joint's distance from the middle of its range that self-motion takes off in a sample, at the limit."""
+"""Fraction by which self-motion reduces a joint's distance from the middle of its range in one sample, at the limit."""
 FREEDOM_RATIO = 1e-3
-"""Singular value of the operators, relative to the largest, below which a freedom is lost."""
+"""Singular value of the operators, relative to the largest, below which a degree of freedom is lost."""
 
 
 class Arm(NamedTuple):
-    """An arm that moves along a path, in place; in a motion frame.
+    """State of an arm that moves along a path, in a motion frame; updated in place.
 
-    ``composition`` as in `kinematics.composition`; ``operators`` (n, 4, 4) and ``joints`` (n,) where it is,
-    ``displacement`` (4, 4) of its body so far, ``bias`` (n,): error of the first step of the sample before.
+    ``composition`` as in `kinematics.composition`; current ``operators`` (n, 4, 4) and ``joints`` (n,),
+    ``displacement`` (4, 4) of its body so far, ``bias`` (n,): error of the first step of the previous sample.
     """
 
     composition: int
@@ -73,7 +75,7 @@ class PathRecord(NamedTuple):
 
 @kernel
 def freedoms(operators: FloatArray) -> int:
-    """Number of freedoms, at most 6, of an arm with ``operators`` (n, 4, 4) in a motion frame."""
+    """Number of degrees of freedom, at most 6, of an arm with ``operators`` (n, 4, 4) in a motion frame."""
     n = operators.shape[0]
     stacked = np.empty((6, n))
     for j in range(n):
@@ -95,7 +97,9 @@ def freedoms(operators: FloatArray) -> int:
 def _normal_equations(
     operators: FloatArray, points: FloatArray, required: FloatArray, N: FloatArray, b: FloatArray
 ) -> float:
-    """Of least ``Σ|Ĥ_j x Δq_j − (x* − x)|²``; the largest ``|x* − x|``."""
+    """Form the normal equations ``N``, ``b`` of least ``Σ|Ĥ_j x Δq_j − (x* − x)|²``; returns the largest
+    ``|x* − x|``.
+    """
     n, m = operators.shape[0], points.shape[0]
     if m > BY_MOMENTS:
         return _normal_equations_by_moments(operators, points, required, N, b)
@@ -126,7 +130,8 @@ def _normal_equations(
 def _normal_equations_by_moments(
     operators: FloatArray, points: FloatArray, required: FloatArray, N: FloatArray, b: FloatArray
 ) -> float:
-    """The same by the moments ``S = Σ x xᵀ`` (4, 4) and ``C = Σ (x* − x) xᵀ`` (3, 4), in which the body comes once.
+    """As `_normal_equations`, from the moments ``S = Σ x xᵀ`` (4, 4) and ``C = Σ (x* − x) xᵀ`` (3, 4): one pass over
+    the body.
 
     ``N_ik = tr(Ĥ_i S Ĥ_kᵀ)``, ``b_i = tr(Ĥ_i Cᵀ)``, of the upper three rows.
     """
@@ -185,10 +190,10 @@ def move_arm(arm: Arm, step: FloatArray) -> None:
 
 @kernel
 def reach(required: FloatArray, constraints: Constraints, arm: Arm, redundant: bool, iterations: int) -> float:
-    """Largest distance left after at most ``iterations`` steps of the arm that bring its body to ``required`` (m, 3).
+    """Move the arm in place so that its body is as near as possible to ``required`` (m, 3), in at most ``iterations``
+    steps; returns the largest remaining distance of a point.
 
-    The arm moves in place, as near as it comes. ``redundant``: it has self-motion, which keeps its joints away from
-    their limits.
+    ``redundant``: the arm has self-motion, which keeps its joints away from their limits.
     """
     body, bias = constraints.body, arm.bias
     n = arm.joints.shape[0]
@@ -247,7 +252,9 @@ def reach(required: FloatArray, constraints: Constraints, arm: Arm, redundant: b
 def pixel_distance(
     cameras: FloatArray, must_stay_visible: FloatArray, X: FloatArray, Y: FloatArray
 ) -> tuple[float, int]:
-    """Largest distance [px] between the images of points (m, 3) and (m, 3), and whose; infinite behind a camera."""
+    """Largest distance [px] between the images of points ``X`` (m, 3) and ``Y`` (m, 3), and the index of that point;
+    infinite behind a camera.
+    """
     worst, which = 0.0, 0
     for c in range(cameras.shape[0]):
         P = cameras[c]
@@ -271,7 +278,7 @@ def pixel_distance(
 
 @kernel
 def _points_on_path(path: FloatArray, path_parameter: float, body: FloatArray, residual: FloatArray) -> FloatArray:
-    """Required points (m, 3) of the body on the path, with its share of the ``residual`` (m, 3) at the end."""
+    """Required points (m, 3) of the body on the path, with the proportional part of the ``residual`` (m, 3)."""
     points = moved(pose_on_path(path, path_parameter), body)
     for p in range(points.shape[0]):
         for i in range(3):
@@ -283,9 +290,10 @@ def _points_on_path(path: FloatArray, path_parameter: float, body: FloatArray, r
 def _deviation_between(
     arm: Arm, joints_before: FloatArray, displacement_before: FloatArray, constraints: Constraints
 ) -> tuple[float, int]:
-    """Distance [px] of the body from its path half-way between two samples, and which marker's.
+    """Distance [px] of the body from its path half-way between two samples, and the index of the marker.
 
-    Near singularities joints run while the body hardly moves, and between samples it leaves the path.
+    Near singularities the joints move fast while the body hardly moves, and the body may leave the path between
+    samples.
     """
     s = constraints
     n = arm.joints.shape[0]
@@ -308,7 +316,7 @@ def _deviation_between(
 
 @kernel
 def _record_sample(k: int, path_parameter: float, constraints: Constraints, arm: Arm, record: PathRecord) -> int:
-    """Record sample ``k`` of the arm and check it: kind of limit broken or −1."""
+    """Record sample ``k`` of the arm and check it; returns the kind of the violated limit or −1."""
     for j in range(arm.joints.shape[0]):
         record.joints[k, j] = arm.joints[j]
     for i in range(4):
@@ -321,9 +329,9 @@ def _record_sample(k: int, path_parameter: float, constraints: Constraints, arm:
 
 
 class Way(NamedTuple):
-    """What a ``stage`` of `path_search` tries: a ``path`` of the body in closed form (`motion_frame`) with ``residual``
-    (m, 3), the distance of each point from its goal at the path's end, distributed over the path; or, straight in the
-    joints, ``joint_step`` (n,) a sample.
+    """Candidate path of a ``stage`` of `path_search`: a ``path`` of the body in closed form (`motion_frame`) with
+    ``residual`` (m, 3), the distance of each point from its goal at the path's end, distributed over the path; or a
+    straight line in joint space with ``joint_step`` (n,) per sample.
     """
 
     stage: int
@@ -333,16 +341,16 @@ class Way(NamedTuple):
 
 
 class SampleRange(NamedTuple):
-    """Samples of a path, from ``first`` to before ``last``."""
+    """Samples of a path, from ``first`` up to, but not including, ``last``."""
 
     first: int
     last: int
 
 
 class Following(NamedTuple):
-    """How an arm has to follow: ``redundant``: it has self-motion, which keeps its joints away from their limits;
-    ``tolerance`` [px] between path and arm: beyond it the path is not reachable; infinite for arms that lack freedoms,
-    which leave the path between its ends.
+    """Settings of an arm that follows a path. ``redundant``: it has self-motion, which keeps its joints away from their
+    limits; ``tolerance`` [px] between path and arm: beyond it the path is not reachable; infinite for arms with missing
+    degrees of freedom, which leave the path between its ends.
     """
 
     redundant: bool
@@ -351,8 +359,8 @@ class Following(NamedTuple):
 
 @kernel
 def check_path(way: Way, some: SampleRange, constraints: Constraints, record: PathRecord) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of ``some`` samples of a path in closed form; of the ``record`` the table
-    of closest approaches is kept.
+    """Check ``some`` samples of a path in closed form; returns the kind of the violated limit or −1, and the sample.
+    Updates the table of closest approaches in ``record``.
     """
     samples = record.joints.shape[0]
     for k in range(some.first, some.last):
@@ -373,9 +381,9 @@ def follow_path(
     following: Following,
     record: PathRecord,
 ) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of the arm along ``some`` samples of a path.
+    """Move the arm along ``some`` samples of a path; returns the kind of the violated limit or −1, and the sample.
 
-    The arm moves in place; ``record`` is filled.
+    The arm is updated in place; ``record`` is filled.
     """
     s = constraints
     redundant, tolerance = following
@@ -410,7 +418,7 @@ def follow_path(
 def follow_joint_line(
     way: Way, some: SampleRange, constraints: Constraints, arm: Arm, record: PathRecord
 ) -> tuple[int, int]:
-    """As `follow_path`, of a way that is a straight line in joint space."""
+    """As `follow_path`, along a straight line in joint space."""
     samples = record.joints.shape[0]
     for k in range(some.first, some.last):
         if k > 0:
@@ -423,15 +431,16 @@ def follow_joint_line(
 
 SEEDS = 32
 ROUNDS = 5
-"""Calls of `reach` from one seed at most."""
+"""Largest number of calls of `reach` from one seed."""
 TURN = 2.0 * math.pi
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
 
 
 def seed_joints(nth: int, joints: FloatArray, lower: FloatArray, upper: FloatArray) -> FloatArray:
-    """Joints (n,) number ``nth`` of a sequence that fills the ranges evenly; number 0: the present joints.
+    """Element ``nth`` of a low-discrepancy sequence of joints (n,) over the joint ranges; element 0: the current
+    joints.
 
-    A range without an end goes half a turn, or one length of the frame, beyond the present position.
+    An unbounded range ends half a turn, or one length of the frame, beyond the current position.
     """
     if nth == 0:
         return joints.copy()
@@ -446,10 +455,10 @@ def seed_joints(nth: int, joints: FloatArray, lower: FloatArray, upper: FloatArr
 def joints_from_seed(
     seed: FloatArray, goal: FloatArray, constraints: Constraints, turns: FloatArray, start: Arm
 ) -> tuple[FloatArray, bool]:
-    """Joints (n,) that bring the body to the ``goal`` (m, 3), found from ``seed`` (n,); and whether they do.
+    """Joints (n,) that bring the body to the ``goal`` (m, 3), found from ``seed`` (n,); and whether they were found.
 
-    ``start``: the arm where its body is now, left as it is. Joints that turn (``turns`` (n,), 1 or 0) are wound into
-    their limits, near to where they are now.
+    ``start``: the arm at the current pose, not modified. Revolute joints (``turns`` (n,), 1 or 0) are changed by full
+    turns into their limits, near their current positions.
     """
     joints, lower, upper = start.joints, constraints.lower, constraints.upper
     n = joints.shape[0]

@@ -1,15 +1,15 @@
-"""Search for a feasible path among alternatives (time profiles, senses of rotation, bent paths, straight lines in
-joint space): a state machine that evaluates a given number of samples a call.
+"""Search for a feasible path among alternatives (time profiles, senses of rotation, bent paths, straight lines in joint
+space): a state machine that evaluates a given number of samples per call.
 
-The alternatives, cheapest first: other profiles, senses and kinds of turning, bent centre lines. A bend takes the
-centre aside by ``4σ(1 − σ) b``, ``b`` a displacement (a point of the plane at infinity): away from the cameras or
-towards them, to the right or left and down or up in the images.
+The alternatives, cheapest first: other profiles, senses and kinds of rotation, bent centre lines. A bend displaces the
+centre by ``4σ(1 − σ) b``, ``b`` a displacement (a point of the plane at infinity): away from the cameras or towards
+them, to the right or left and down or up in the images.
 
-``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: the arm along it. Where the arm
-cannot follow the path that was asked for, ``UNCONSTRAINED_IK`` follows it once more without limits, which gives the
-joints at the goal, and ``STRAIGHT_IN_JOINTS`` tries the straight line in joint space to these. When all else fails,
-``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these; the
-``posture`` of a request is then the only seed.
+``CLOSED_FORM``: a path in closed form, checked in the images alone. ``FOLLOW_PATH``: inverse kinematics along it. If
+the arm cannot follow the requested path, ``UNCONSTRAINED_IK`` follows it again without limits, which gives the joints
+at the goal, and ``STRAIGHT_IN_JOINTS`` tries the straight line in joint space to them. If all others fail,
+``MULTISTART_IK`` finds other joints at the goal from many seeds, and ``STRAIGHT_IN_JOINTS`` tries these. If a request
+has a ``posture``, it is the only seed.
 """
 
 from __future__ import annotations
@@ -66,38 +66,42 @@ from stereoservo.planning.visibility_constraints import (
 )
 
 SAMPLES = 65
-"""Of a path: half a turn in steps of three degrees."""
+"""Number of samples of a path: half a turn in steps of three degrees."""
 TOLERANCE_PX = 2.0
 """Largest distance in the images between the path and the arm that follows it, and between its end and the goal."""
 WORK_OF_ARM = 16
-"""Work of one sample of the arm, in samples of the closed form in the images."""
+"""Work of one sample of the arm, in units of one sample in closed form."""
 WORK_OF_PATH = 8
-"""Work of setting up one path, likewise."""
+"""Work of setting up one path, in the same unit."""
 WORK_OF_SEED = 20 * WORK_OF_ARM
-"""Work of seeking the goal from one seed, likewise."""
+"""Work of inverse kinematics at the goal from one seed, in the same unit."""
 MOST_FOLLOWED = 120
-"""Paths that the arm follows before the search ends."""
+"""Number of paths that the arm follows before the search ends."""
 GOAL_MISSED = 30
-"""What a path counts that ends beside the goal, for want of freedoms: few others will do better."""
+"""Number of followed paths that a path counts for if it misses the goal because of missing degrees of freedom: others
+will hardly do better.
+"""
 GOAL_BEYOND = 90
-"""What it counts that the goal itself is beyond a joint's limit, unless joints turn there another way."""
+"""Number of followed paths to count if the goal itself is beyond a joint's limit, unless it is reachable with other
+turns of the joints.
+"""
 
 POSTURE = 0.35
-"""Largest distance of a joint [rad or m] at the goal from the posture that was asked for."""
+"""Largest distance of a joint [rad or m] at the goal from the requested posture."""
 THERE = 1e-6
-"""Joints that are no farther from the goal's are there."""
+"""Distance of the joints from those at the goal [rad or m] up to which they are at the goal."""
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
-"""What the ``index`` of an approach NOT_REACHABLE names."""
+"""Components to which the ``index`` of an approach NOT_REACHABLE refers."""
 
 AWAY = (0.0, 0.12, 0.25, 0.45, 0.7, -0.12, -0.25)
-"""Bends away from the cameras, as shares of their distance from the centre."""
+"""Bends away from the cameras, as fractions of their distance from the centre."""
 ASIDE = (0.0, 0.07, -0.07, 0.15, -0.15, 0.25, -0.25)
 """Bends to the right and down, likewise."""
 PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first", "planar-first")
 PROFILE_COST = 0.06
 TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
-"""Of the kinds of turning, in the order of `planner.turnings`, in the measure of the bends."""
+"""Costs of the kinds of rotation, in the order of `planner.turnings`, in units of the bends."""
 SHAPES: dict[Profile, tuple[float, float, float]] = {
     "linear": (LINEAR, LINEAR, LINEAR),
     "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
@@ -105,11 +109,11 @@ SHAPES: dict[Profile, tuple[float, float, float]] = {
     "rotation-first": (LAST, FIRST, FIRST),
     "planar-first": (LAST, LAST, FIRST),
 }
-"""Of each profile: how translation, hinge and planar rotation go (`motion_frame`)."""
+"""Shapes of translation, hinge and planar rotation for each profile (`motion_frame`)."""
 
 
 class Candidate(NamedTuple):
-    """One path: ``turning`` of `planner.turnings`, ``profile`` 0 the one asked for, ``bend`` away, right, down."""
+    """One path: ``turning`` of `planner.turnings`, ``profile`` 0 is the requested one, ``bend`` away, right, down."""
 
     turning: int
     profile: int
@@ -130,11 +134,11 @@ def _ordered() -> tuple[Candidate, ...]:
 
 
 CANDIDATES = _ordered()
-"""All paths, the straight one with the profile that was asked for first."""
+"""All candidate paths; the first is the straight one with the requested profile."""
 
 
 class Stage(IntEnum):
-    """What the next samples are of."""
+    """Kind of the next samples."""
 
     CLOSED_FORM = 0
     FOLLOW_PATH = 1
@@ -144,16 +148,16 @@ class Stage(IntEnum):
 
 
 CLOSED_FORM, STRAIGHT_IN_JOINTS = int(Stage.CLOSED_FORM), int(Stage.STRAIGHT_IN_JOINTS)
-"""As kernels know them."""
+"""The stages as integers, for kernels."""
 
 
 class Planning(msgspec.Struct, eq=False):
-    """Work on a plan, between two slices. ``finished``: there is a ``plan``, or a ``failure``.
+    """State of planning between two slices. ``finished``: there is a ``plan``, or a ``failure``.
 
-    ``failure``: that of the goal itself, where it has one, that of the requested path, that of the other path that came
+    ``failure``: the failures of the goal itself, if any, of the requested path, and of the alternative path that came
     farthest. ``frame`` (4, 4) and its ``inverse``: the motion frame; ``goal`` (m, 3) in it. ``operators``, ``joints``,
-    ``displacement`` (4, 4): the arm at ``sample`` of the path number ``candidate``; ``table``: closest
-    approaches so far.
+    ``displacement`` (4, 4): the arm at ``sample`` of the path number ``candidate``; ``table``: closest approaches so
+    far.
     """
 
     request: PlanRequest
@@ -194,7 +198,7 @@ class Planning(msgspec.Struct, eq=False):
 
 
 def plan_on(planning: Planning, samples: float) -> None:
-    """Evaluate at most ``samples`` samples of paths, one at least (those in the images alone count a sixteenth)."""
+    """Evaluate at most ``samples`` samples of paths, at least one (samples in closed form count a sixteenth)."""
     p = planning
     work = max(1, round(samples * WORK_OF_ARM))
     while work > 0 and not p.finished:
@@ -216,7 +220,7 @@ def plan_on(planning: Planning, samples: float) -> None:
 
 
 def next_candidate(planning: Planning) -> None:
-    """Set up the next candidate path that differs from those before it; finish where there is none."""
+    """Set up the next candidate path that differs from the previous ones; finish if there is none."""
     p = planning
     p.stage, p.sample = int(Stage.CLOSED_FORM), 0
     p.table = empty_table()
@@ -230,7 +234,7 @@ def next_candidate(planning: Planning) -> None:
             continue
         path = path_of(candidate, profile, p.turnings[candidate.turning], p.centre_translation, p.directions)
         if candidate.profile > 1 and float(np.abs(path[14:]).max()) == LINEAR:
-            continue  # one component alone: the linear path again
+            continue  # only one component: identical to the linear path
         p.path = path
         p.tried += 1
         return
@@ -246,12 +250,12 @@ def _give_up(p: Planning) -> None:
 
 
 def go_to_posture(planning: Planning) -> None:
-    """Plan for the posture that the request names, and for no other."""
+    """Plan for the requested posture only."""
     planning.stage, planning.sample = int(Stage.MULTISTART_IK), 0
 
 
 def _next_seed(p: Planning) -> None:
-    """Find the goal's joints from the next seed; where they keep the limits, the straight line to them is next."""
+    """Find the joints at the goal from the next seed; if within the limits, the straight line to them is tried next."""
     if p.seeds >= SEEDS:
         _give_up(p)
         return
@@ -265,8 +269,8 @@ def _next_seed(p: Planning) -> None:
 
 
 def _from_posture(p: Planning, posture: FloatArray) -> None:
-    """Likewise from the ``posture`` (n,) alone, with as many whole turns; a failure says how far from the goal the
-    markers are in it.
+    """Find the joints at the goal from the ``posture`` (n,) alone, with the same number of full turns; a failure states
+    the distance of the markers from the goal in that posture.
     """
     p.seeds = SEEDS
     joints, arrived = _from_joints(p, posture)
@@ -289,7 +293,7 @@ def _from_posture(p: Planning, posture: FloatArray) -> None:
 
 
 def stay(planning: Planning) -> None:
-    """The goal is the present pose: a plan of no duration."""
+    """Finish with a plan of zero duration: the goal is the current pose."""
     p = planning
     start_arm(p, Stage.STRAIGHT_IN_JOINTS)
     broken, _ = _samples(p, 1)
@@ -308,7 +312,7 @@ def stay(planning: Planning) -> None:
 
 
 def start_arm(planning: Planning, stage: Stage) -> None:
-    """Put the arm back to its present joints, for ``stage``."""
+    """Reset the arm to its current joints, for ``stage``."""
     p = planning
     p.stage, p.sample = int(stage), 0
     p.operators = p.start_operators.copy()
@@ -319,9 +323,11 @@ def start_arm(planning: Planning, stage: Stage) -> None:
 
 
 def _samples(p: Planning, until: int) -> tuple[int, int]:
-    """Samples of the present stage: kind of limit broken or −1, and up to where."""
+    """Evaluate samples of the current stage before ``until``; returns the kind of violated limit or −1, and the last
+    sample.
+    """
     unconstrained = p.stage == Stage.UNCONSTRAINED_IK
-    # an arm that lacks freedoms leaves the path between its ends
+    # an arm with missing degrees of freedom leaves the path between its ends
     tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
     constraints = _unlimited(p.constraints) if unconstrained else p.constraints
     broken, reached = _go_on(
@@ -339,7 +345,9 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
 def _go_on(
     way: Fields, some: Fields, constraints: Fields, arm: Fields, following: Fields, record: Fields
 ) -> tuple[int, int]:
-    """Kind of limit broken or −1, and where, of samples of a way (`path_ik`), with the fields of all records."""
+    """Evaluate samples of a candidate path (`path_ik`), given the fields of all records; returns the kind of the
+    violated limit or −1, and the sample.
+    """
     tried, span, bounds, kept = Way(*way), SampleRange(*some), Constraints(*constraints), PathRecord(*record)
     if tried.stage == CLOSED_FORM:
         return check_path(tried, span, bounds, kept)
@@ -377,7 +385,7 @@ def _fail(p: Planning, kind: int) -> None:
 
 
 def _end(p: Planning) -> None:
-    """The last sample of a stage is done."""
+    """Continue after the last sample of a stage."""
     if p.stage == Stage.CLOSED_FORM:
         p.followed += 1
         start_arm(p, Stage.FOLLOW_PATH)
@@ -406,7 +414,7 @@ def _distance_from_goal(displacement: FloatArray, constraints: Constraints, goal
 def _distance_in_posture(
     posture: FloatArray, constraints: Constraints, goal: FloatArray, start: Arm
 ) -> tuple[float, int]:
-    """Likewise with the arm of ``start`` in a ``posture`` (n,)."""
+    """`_distance_from_goal` with the arm of ``start`` in a ``posture`` (n,)."""
     displacement = np.eye(4)
     arm = Arm(start.composition, start.operators.copy(), start.joints.copy(), displacement, start.bias.copy())
     move_arm(arm, posture - start.joints)
@@ -414,7 +422,7 @@ def _distance_in_posture(
 
 
 def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
-    """Go on with the nearer of the joints at the end of the requested path and those of a direct step to the goal."""
+    """Continue with the nearer of the joints at the requested path's end and those of a direct step to the goal."""
     start, s = writable_copy(p.request.joints), p.constraints
     found, table = [], empty_table()
     if not missed:
@@ -452,7 +460,7 @@ def _arm_at_start(p: Planning) -> Arm:
 
 
 def _straight_to(p: Planning, joints: FloatArray) -> None:
-    p.goal_failure = None  # of another posture, not of the goal
+    p.goal_failure = None  # it belongs to another posture, not to the goal
     p.joint_step = (joints - p.request.joints) / (SAMPLES - 1.0)
     start_arm(p, Stage.STRAIGHT_IN_JOINTS)
 
@@ -482,7 +490,7 @@ def _finish(p: Planning) -> None:
 def _in_time(
     joints: FloatArray, displacements: FloatArray, frame: FloatArray, inverse: FloatArray, pace: JointPace
 ) -> tuple[FloatArray, FloatArray]:
-    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) out of the motion ``frame``."""
+    """`sample_times` (K,) of ``joints`` (K, n), and their ``displacements`` (K, 4, 4) outside the motion ``frame``."""
     times = sample_times(joints, pace.velocity_max, pace.acceleration_max, pace.even)
     return times, conjugate_all(frame, displacements, inverse)
 
@@ -492,7 +500,7 @@ def _straight(candidate: Candidate) -> bool:
 
 
 def _missing_freedom(p: Planning) -> float:
-    """Which of `MISSING_FREEDOMS` is most of the distance between the body and its pose on the path."""
+    """Index in `MISSING_FREEDOMS` of the largest component of the body's distance from its pose on the path."""
     body = p.constraints.body
     required = p.goal
     if p.stage != Stage.STRAIGHT_IN_JOINTS:
@@ -542,7 +550,7 @@ def face_normal(points: FloatArray, faces: IntArray) -> FloatArray | None:
 
 
 def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Shapes for components of ``amounts``; where only one kind of shape has anything to do, nothing waits: linear."""
+    """Profile shapes for components of ``amounts``; linear if all moving components have the same shape."""
     own = SHAPES[profile]
     at_work = {shape for shape, amount in zip(own, amounts, strict=True) if amount != 0.0}
     if profile == "exponential" or len(at_work) > 1:
@@ -569,7 +577,7 @@ def path_of(
 
 
 def other_profile(asked: Profile, nth: int) -> Profile | None:
-    """The profile number ``nth`` of a candidate; None where it is the one asked for again."""
+    """Profile number ``nth`` of a candidate; None if it equals the requested one."""
     if nth == 0:
         return asked
     profile = PROFILES[nth - 1]
@@ -577,7 +585,7 @@ def other_profile(asked: Profile, nth: int) -> Profile | None:
 
 
 def name_of(candidate: Candidate, profile: Profile) -> str:
-    """Description of a path for people."""
+    """Description of a path for the operator."""
     kinds = ("", "one rotation", "the other way round", "planar rotation the other way round")
     kind = (*kinds, "one rotation the other way round")[candidate.turning]
     words = (("away from the cameras", "towards the cameras"), ("right", "left"), ("down", "up"))
@@ -593,31 +601,31 @@ def name_of(candidate: Candidate, profile: Profile) -> str:
 # Time-optimal scaling of a path: the fastest times that keep the joints' velocity and acceleration limits.
 #
 # The pace ``x = ṡ²`` along the samples ``s`` is bounded by the velocities, its slope ``2s̈`` by the accelerations ``q'
-# s̈ + q'' ṡ²``; both are linear in ``x``, so that a pass backwards (from which pace can the arm still stop?) and a
-# greedy pass forwards give the fastest (Pham and Pham, 2018). Starts and ends at rest.
+# s̈ + q'' ṡ²``; both are linear in ``x``, so that a backward pass (from which pace can the arm still stop?) and a
+# greedy forward pass give the fastest times (Pham and Pham, 2018). Starts and ends at rest.
 
 
 FASTEST = 1e8
-"""Largest pace [(samples/s)²]: where no joint moves, the way is over in a ten-thousandth of a second a sample."""
+"""Largest pace [(samples/s)²]: if no joint moves, a sample lasts a ten-thousandth of a second."""
 HALVINGS = 50
 ROUNDS = 12
-"""Times at most that the pace is lowered where the way between samples is faster than at them."""
+"""Largest number of times that the pace is reduced where rates between samples exceed those at the samples."""
 LOOKS = 4
-"""Places in an interval at which its rates are looked at."""
+"""Number of points in an interval at which its rates are checked."""
 VELOCITY_EXCESS, ACCELERATION_EXCESS = 1.01, 1.25
-"""Of the limits, what the cubics between samples may have; accelerations as means over an interval."""
+"""Largest velocity and mean acceleration in an interval of the cubics between samples, relative to the limits."""
 
 
 @kernel
 def _next_paces(
     slope: FloatArray, bow: FloatArray, limits: FloatArray, pace: float, ceiling: float
 ) -> tuple[float, float]:
-    """Least and largest pace after an interval that begins with ``pace``; empty where the first is above the second."""
+    """Least and largest pace after an interval that begins with ``pace``; none if the first exceeds the second."""
     least, largest = 0.0, ceiling
     for j in range(slope.shape[0]):
         if not math.isfinite(limits[j]):
             continue
-        # q' (x⁺ − x)/2 + q'' x within the limit at the begin, likewise with x⁺ at the end
+        # q' (x⁺ − x)/2 + q'' x within the limit at the start, likewise with x⁺ at the end
         for end in range(2):
             if end == 0:
                 rate = slope[j] - 0.5 * bow[j]
@@ -640,7 +648,7 @@ def _next_paces(
 def _times_below(
     slopes: FloatArray, bows: FloatArray, highest: FloatArray, acceleration_max: FloatArray, even: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """The least times (K,) with paces at the samples not above ``highest`` (K,); and these paces (K,)."""
+    """Least times (K,) for which the paces at the samples do not exceed ``highest`` (K,); and these paces (K,)."""
     K = highest.shape[0]
     times, paces = np.zeros(K), np.zeros(K)
     ceilings = highest.copy()
@@ -674,7 +682,7 @@ def _times_below(
             after = 0.0
         both = math.sqrt(pace) + math.sqrt(after)
         if both <= 0.0:
-            # from rest to rest in one interval: half the way each
+            # from rest to rest in one interval: half of it for each
             duration = 0.0
             for j in range(slopes.shape[1]):
                 if math.isfinite(acceleration_max[j]):
@@ -691,13 +699,13 @@ def _times_below(
 def _excess(
     times: FloatArray, joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, k: int
 ) -> float:
-    """By how much the pace in interval ``k`` has to come down; at most 1 where it need not."""
+    """Factor by which the pace in interval ``k`` must be reduced; 1 if it need not be."""
     n = joints.shape[1]
     q, rates, first = np.empty(n), np.empty(n), np.empty(n)
     duration = times[k + 1] - times[k]
     found = 1.0
     for look in range(LOOKS + 1):
-        # the last look is at the end, where the next interval's first one sees the same rates
+        # the last point is the end, where the next interval begins with the same rates
         interpolate_into(times, joints, times[k] + duration * look / LOOKS, q, rates)
         for j in range(n):
             speed = abs(rates[j])
@@ -713,8 +721,8 @@ def _excess(
 
 
 class JointPace(NamedTuple):
-    """How fast joints may go: ``velocity_max`` (n,) [rad/s or m/s], ``acceleration_max`` (n,) [rad/s² or m/s²], and
-    whether samples follow each other at an ``even`` pace.
+    """Speed limits of the joints: ``velocity_max`` (n,) [rad/s or m/s], ``acceleration_max`` (n,) [rad/s² or m/s²], and
+    whether the samples have an ``even`` (constant) pace.
     """
 
     velocity_max: FloatArray
@@ -724,9 +732,9 @@ class JointPace(NamedTuple):
 
 @kernel
 def sample_times(joints: FloatArray, velocity_max: FloatArray, acceleration_max: FloatArray, even: bool) -> FloatArray:
-    """Times (K,) [s] from 0 of the samples ``joints`` (K, n), with limits (n,), infinite where there is none.
+    """Times (K,) [s] from 0 of the samples ``joints`` (K, n), with limits (n,), infinite if there is none.
 
-    ``even``: the samples follow each other at one pace, as far as accelerations let them.
+    ``even``: the samples have a constant pace, as far as the accelerations allow.
     """
     K, n = joints.shape
     times = np.zeros(K)

@@ -1,7 +1,7 @@
-"""Data types of path planning: the request with its limits, the closest approach of a path to each limit, and the
-plan, a path of the marker body and the arm's joints in time.
+"""Data types of path planning: the request with its limits, the closest approach of a path to each limit, and the plan,
+a path of the marker body and the arm's joints in time.
 
-Plain data; `planner` makes it, a slice of work at a time, so that a loop may plan while it runs.
+Plain data; `planner` computes it in slices of work, so that the loop can plan while it runs.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ Limit = Literal["JOINT_LIMIT", "KEEP_OUT", "FIELD_OF_VIEW", "FACE_HIDDEN", "BEHI
 class PlanLimits(msgspec.Struct, frozen=True, eq=False):
     """Limits that a path must respect.
 
-    ``position_min``, ``position_max``, ``velocity_max``, ``acceleration_max`` (n,), margins taken off already;
-    ``keep_outs`` (k, n, 2) boxes in joint space. ``sizes`` (c, 2) images [px], ``lenses`` (c, 4) as
-    `geometry.distortion` has them, ``view_margin_px`` from the images' borders.
+    ``position_min``, ``position_max``, ``velocity_max``, ``acceleration_max`` (n,), with margins already subtracted;
+    ``keep_outs`` (k, n, 2) boxes in joint space. ``sizes`` (c, 2) of the images [px], ``lenses`` (c, 4) as in
+    `geometry.distortion`, ``view_margin_px``: distance from the image borders [px].
     """
 
     position_min: FloatArray
@@ -35,14 +35,14 @@ class PlanLimits(msgspec.Struct, frozen=True, eq=False):
 
 
 class PlanRequest(msgspec.Struct, frozen=True, eq=False):
-    """A request for a plan: from which pose to which, with what arm, cameras and limits.
+    """A request for a plan: start and goal pose, arm, cameras and limits.
 
-    ``operators`` (n, 4, 4), ``joints`` (n,), ``points`` (m, 4) now; ``targets`` (m, 4) at the goal; ``centre``,
-    ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces that must stay visible to every camera
-    that sees them now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of these cameras.
-    ``bend``: whether detours from ``profile``'s straight path are searched where that is not feasible.
+    ``operators`` (n, 4, 4), ``joints`` (n,), ``points`` (m, 4): current markers; ``targets`` (m, 4): markers at the
+    goal; ``centre``, ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces that must stay visible
+    to every camera that sees them now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of
+    these cameras. ``bend``: whether detours from ``profile``'s straight path are searched if that path is not feasible.
     ``speed_scale`` (0, 1] of velocity and acceleration limits. ``posture`` (n,): joints near which the plan ends, on
-    the straight line in the joints, where the arm reaches the goal by several postures.
+    the straight line in joint space, if the arm can reach the goal in several postures.
     """
 
     operators: FloatArray
@@ -64,11 +64,10 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
 
 
 class ClosestApproach(msgspec.Struct, frozen=True):
-    """Closest approach of a path to one limit, or where it breaks it.
+    """Closest approach of a path to one limit, or its violation.
 
-    ``index``: of the joint, keep-out or camera; ``marker``: index of the marker, -1 where none is meant. ``value`` and
-    ``limit`` in ``unit``; ``room``: what is left, negative where the limit is broken. ``share`` in [0, 1]: the
-    path parameter.
+    ``index``: of the joint, keep-out or camera; ``marker``: index of the marker, -1 for none. ``value`` and ``limit``
+    in ``unit``; ``room``: clearance, negative if the limit is violated. ``share``: path parameter in [0, 1].
     """
 
     what: Limit
@@ -82,11 +81,11 @@ class ClosestApproach(msgspec.Struct, frozen=True):
 
 
 class Plan(msgspec.Struct, frozen=True, eq=False):
-    """A feasible path in time: K samples from now to the goal.
+    """A feasible path in time: K samples from the current pose to the goal.
 
-    ``times`` (K,) [s] from 0, ``joints`` (K, n), ``displacements`` (K, 4, 4) of the body from its present pose,
-    ``shares`` (K,): path parameters. ``way``: its name for people, e.g. "linear" or "bent away from the camera by 0.1".
-    ``approaches``: the closest to every kind of limit.
+    ``times`` (K,) [s] from 0, ``joints`` (K, n), ``displacements`` (K, 4, 4) of the body from its current pose,
+    ``shares`` (K,): path parameters. ``way``: description for the operator, e.g. "linear" or "bent away from the camera
+    by 0.1". ``approaches``: the closest approach to each kind of limit.
     """
 
     times: FloatArray

@@ -1,9 +1,9 @@
 """Path planner: plans the path of a marker body and of the arm's joints before the arm moves, in slices of work short
 enough for a control loop; checks the request and prepares the search.
 
-`start_planning` checks a request, converts it into a motion frame and decides what can be decided at once: a goal out
-of view, or hidden, or the present pose itself. `plan_on` then tries one candidate path after the other
-(`path_search`). The state between two slices is plain data; how the work is sliced changes no bit of the result.
+`start_planning` checks a request, converts it into a motion frame and decides simple cases at once: a goal out of view,
+or hidden, or equal to the current pose. `plan_on` then tries one candidate path after the other (`path_search`). The
+state between two slices is plain data; the result does not depend on the slicing, bit for bit.
 """
 
 from __future__ import annotations
@@ -58,23 +58,23 @@ __all__ = [
 ]
 
 PRESENT = 1e-6
-"""Distance of all points from their goals, relative to the cameras' distance, at which there is nothing to do."""
+"""Distance of all points from their goals, relative to the cameras' distance, up to which no motion is needed."""
 TURNS = 1e-6
-"""Size of a joint's rotation block, in the motion frame, from which on it turns."""
+"""Norm of a joint's rotation block, in the motion frame, from which on it counts as revolute."""
 COLLINEAR = 1e-6
-"""Square of the sine, seen from the middle, below which all markers are on one line."""
+"""Squared sine of the angles at the centroid below which all markers are collinear."""
 
 NO_ANGLE = 1e-9
 PARALLEL = 1e-7
-"""Sine below which two normals are one."""
+"""Sine below which two normals are parallel."""
 
 
 class PlanRequestError(ValueError):
-    """A request that no plan can answer: numbers that are not finite, no limits, markers or a face on one line."""
+    """An invalid plan request: numbers that are not finite, invalid limits, collinear markers or a collinear face."""
 
 
 def plan(request: PlanRequest) -> Planning:
-    """Finished planning of a request, in one go. Raises PlanRequestError."""
+    """Plan a request completely, in one call. Raises PlanRequestError."""
     planning = start_planning(request)
     while not planning.finished:
         plan_on(planning, 10 * SAMPLES)
@@ -82,7 +82,9 @@ def plan(request: PlanRequest) -> Planning:
 
 
 def start_planning(request: PlanRequest) -> Planning:
-    """State from which `plan_on` continues, or finished where all is decided at once. Raises PlanRequestError."""
+    """Planning state from which `plan_on` continues, or a finished one if the request is decided at once. Raises
+    PlanRequestError.
+    """
     r = request
     _check(r)
     operators = writable_copy(r.operators)
@@ -164,7 +166,7 @@ def _check(request: PlanRequest) -> None:
 
 
 def _check_limits(limits: PlanLimits) -> None:
-    """Limits that are no numbers, or not above zero where a joint has to move, would be none."""
+    """Raise PlanRequestError if limits are NaN, or not positive for a joint that must move."""
     for name in ("velocity_max", "acceleration_max", "sizes"):
         values = getattr(limits, name)
         if not (np.asarray(values) > 0.0).all():
@@ -181,7 +183,7 @@ def _check_limits(limits: PlanLimits) -> None:
 def _into_frame(operators: FloatArray, points: FloatArray, first: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Motion frame and its inverse (4, 4), and ``points`` (k, 4) of height 1 as (k, 3) in it.
 
-    Of the points, the camera centres begin at ``first``; the last but one is the centre, the last the centre's target.
+    In ``points``, the camera centres begin at ``first``; the last but one is the centre, the last the centre's target.
     """
     k = points.shape[0]
     frame = motion_frame(operators, plane_at_infinity(operators, points), points[k - 2], points[first : k - 2])
@@ -198,9 +200,9 @@ def _whole_displacement(
     inverse: FloatArray,
     operators: FloatArray,
 ) -> tuple[FloatArray, FloatArray, FloatArray, int]:
-    """What takes ``body`` (m, 3) to ``goal`` (m, 3): rotation as axis and angle (4,), and what is left (m, 3) beside it
-    and the ``translation`` (3,) of the centre. And the arm's ``operators`` (n, 4, 4) in the motion frame, and its
-    number of freedoms.
+    """Displacement from ``body`` (m, 3) to ``goal`` (m, 3): rotation as axis and angle (4,), and the residual (m, 3)
+    after it and the ``translation`` (3,) of the centre; and the arm's ``operators`` (n, 4, 4) in the motion frame, and
+    its number of degrees of freedom.
     """
     rotation = turn_between(body, goal)
     whole = np.zeros(NUMBERS)
@@ -214,7 +216,7 @@ def _whole_displacement(
 
 
 def _useful(kinds: FloatArray) -> tuple[bool, ...]:
-    """Which kinds of turning (5, 8) differ from those before them."""
+    """For each kind of rotation (5, 8), whether it differs from the previous ones."""
     hinge, planar = float(kinds[0, 3]) != 0.0, float(kinds[0, 7]) != 0.0
     both = hinge and planar
     return True, both, hinge, planar, both
@@ -273,10 +275,11 @@ def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArra
 
 
 def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
-    """Hinge axis and angle, planar axis and angle (8,) of each kind of turning, for a rotation ``(axis, angle)`` (4,).
+    """Hinge axis and angle, planar axis and angle (8,) of each kind of rotation, for a rotation ``(axis, angle)`` (4,).
 
-    Hinge and planar rotation of the face of ``normal`` (3,), the shorter ones; one rotation about the centre; the hinge
-    the other way round; the planar rotation the other way round; the one rotation the other way round (7.4.1, 7.4.2).
+    The kinds: hinge and planar rotation of the face of ``normal`` (3,), both by the smaller angle; a single rotation
+    about the centre; the hinge in the other sense; the planar rotation in the other sense; the single rotation in the
+    other sense (7.4.1, 7.4.2).
     """
     axis, angle = rotation[:3], float(rotation[3])
     whole = 2.0 * math.pi
@@ -313,7 +316,7 @@ def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatAr
     if sine > PARALLEL:
         hinge = axis / sine
     else:
-        # one plane, or back on face: half a turn about any line in it
+        # parallel or opposite normals: half a turn about any line in the plane
         least = 0
         for i in range(1, 3):
             if abs(normal[i]) < abs(normal[least]):
@@ -324,7 +327,7 @@ def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatAr
         hinge /= math.sqrt(_dot(hinge, hinge))
     theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
     back = turn(hinge, -theta_r)
-    # the planar rotation R_p = R_r⁻¹ R, read on a direction in the face
+    # the planar rotation R_p = R_r⁻¹ R, measured on a direction in the face
     inside = _cross(normal, hinge)
     image = np.empty(3)
     turned = np.empty(3)

@@ -1,11 +1,11 @@
 """Primitive motions of an arm from its projective joint operators: joint velocities of a translation, a revolution
 about an axis, and a revolution of a plane in itself (thesis 7.3).
 
-Each is the kernel of an (8, n) system in the operators ``Ĥ_j|_Q`` (n, 4, 4) at the current configuration. The
-systems are not solved in joint velocities but in an orthonormal basis of the operators that the arm can make
-now (`arm_freedoms`): self-motions of a redundant arm are gone from it, and singular values measure geometry,
-not how far the arm is from a singularity. The operators are estimates, so no smallest singular value is zero:
-what counts is its ratio to the second.
+Each is the kernel of an (8, n) system in the operators ``Ĥ_j|_Q`` (n, 4, 4) at the current configuration. The systems
+are solved not in joint velocities but in an orthonormal basis of the operators that the arm can make at its
+configuration (`arm_freedoms`): the basis contains no self-motions of a redundant arm, and singular values measure
+geometry, not the distance from a singularity. The operators are estimates, so the smallest singular value is never
+zero: the criterion is its ratio to the second.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from stereoservo.geometry.homogeneous import GeometryError, line_of_planes, plan
 from stereoservo.numerics.arrays import FloatArray
 
 RANK_RATIO = 1e-4
-"""Singular value of the stacked operators, relative to the largest, below which a freedom is lost."""
+"""Singular value of the stacked operators, relative to the largest, below which a degree of freedom is lost."""
 
 REACH_RATIO = 0.03
-"""Smallest to second singular value above which an arm of fewer than six freedoms cannot make the motion."""
+"""Smallest to second singular value above which an arm of fewer than six degrees of freedom cannot make the motion."""
 
 NOISE_RATIO = 0.5
-"""The same for an arm of six freedoms, which can make any: what is left there is error of the operators."""
+"""The same for an arm of six degrees of freedom, which can make any motion: its residual is error of the operators."""
 
 DEGENERATE_RATIO = 1e-9
-"""Second to largest singular value below which a system names no single motion."""
+"""Second to largest singular value below which a system does not define a unique motion."""
 
 RIGID_FREEDOMS = 6
 
@@ -37,10 +37,9 @@ PLANAR = "revolution of the face in its plane"
 
 
 class NotReachableError(Exception):
-    """The arm, as it stands, cannot make a primitive motion.
+    """The arm cannot make a primitive motion at its configuration.
 
-    ``freedom`` names it; ``ratio`` of smallest to second singular value, ``threshold`` what would have been
-    valid.
+    ``freedom``: name of the motion; ``ratio`` of smallest to second singular value; ``threshold``: largest valid ratio.
     """
 
     def __init__(self, freedom: str, ratio: float, threshold: float) -> None:
@@ -54,9 +53,7 @@ class NotReachableError(Exception):
 
 
 class DegenerateStepError(Exception):
-    """The points or planes name no single motion: the centre is on target, the faces are coplanar. ``what``
-    says it.
-    """
+    """The points or planes do not define a unique motion: centre on target, coplanar faces. ``what``: the cause."""
 
     def __init__(self, what: str) -> None:
         super().__init__(what)
@@ -65,7 +62,7 @@ class DegenerateStepError(Exception):
 
 @dataclass(frozen=True, eq=False)
 class Freedoms:
-    """What an arm can do now: ``joints`` (n, r), velocities whose operators are orthonormal as 16-vectors.
+    """Instantaneous motions of an arm: ``joints`` (n, r), velocities whose operators are orthonormal as 16-vectors.
 
     ``values``: singular values of the stacked operators (16, n), descending; r <= 6 of them count.
     """
@@ -100,11 +97,10 @@ def arm_freedoms(operators: FloatArray) -> Freedoms:
 def translation_along_axis(
     operators: FloatArray, A1: FloatArray, A2: FloatArray, freedoms: Freedoms | None = None
 ) -> Primitive:
-    """Translation along the line of two points ``(4,)`` of one height: the pencil of its planes stands still
-    (7.18).
+    """Translation along the line of two points ``(4,)`` of equal height: the pencil of its planes is fixed (7.18).
 
-    Scaled so that it displaces ``A1`` by a 4-vector of length 1, towards ``A2``. Raises NotReachableError,
-    and DegenerateStepError where the points are one.
+    Scaled so that it displaces ``A1`` by a 4-vector of length 1, towards ``A2``. Raises NotReachableError, and
+    DegenerateStepError if the points coincide.
     """
     try:
         planes = planes_through_line(A1, A2)
@@ -122,9 +118,9 @@ def translation_along_axis(
 def revolution_around_axis(
     operators: FloatArray, A1: FloatArray, A2: FloatArray, freedoms: Freedoms | None = None
 ) -> Primitive:
-    """Rotation about the axis of two points ``(4,)``, which stand still (7.19); eigenvalues ±i, either sense.
+    """Rotation about the axis through two points ``(4,)``, which are fixed (7.19); eigenvalues ±i, either sense.
 
-    Raises NotReachableError, and DegenerateStepError where the points are one.
+    Raises NotReachableError, and DegenerateStepError if the points coincide.
     """
     try:
         points = line_of_planes(*planes_through_line(A1, A2))
@@ -137,10 +133,9 @@ def revolution_around_axis(
 def revolution_in_plane(
     operators: FloatArray, a: FloatArray, A: FloatArray, freedoms: Freedoms | None = None
 ) -> Primitive:
-    """Rotation of a plane ``a`` (4,) in itself about its point ``A`` (4,) (7.20); eigenvalues ±i, either
-    sense.
+    """Rotation of a plane ``a`` (4,) in itself about its point ``A`` (4,) (7.20); eigenvalues ±i, either sense.
 
-    Raises NotReachableError, and DegenerateStepError where they name no axis.
+    Raises NotReachableError, and DegenerateStepError if they define no axis.
     """
     system = np.concatenate(
         [
@@ -168,7 +163,7 @@ def _kernel(operators: FloatArray, system: FloatArray, freedoms: Freedoms | None
         raise NotReachableError(freedom, 1.0, REACH_RATIO)
     _, values, rows = np.linalg.svd(system @ basis)
     smallest, largest = float(values[rank - 1]), float(values[0])
-    # An arm of one freedom has no second value; unit planes, points and operators give about 1.
+    # An arm of one degree of freedom has no second value; unit planes, points and operators give about 1.
     second = float(values[rank - 2]) if rank > 1 else 1.0
     if second <= DEGENERATE_RATIO * largest:
         raise DegenerateStepError(f"{freedom}: more than one motion fits (second singular value {second:.3g})")

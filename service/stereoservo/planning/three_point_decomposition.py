@@ -1,9 +1,9 @@
 """Decomposition of the displacement of three points of a body into a translation, a hinge rotation that aligns their
 plane, and a rotation in that plane, each with the arm's joint velocity (thesis 7.4.1, 7.4.2).
 
-The three are meant to be driven together: each leaves alone what the others align. All points, the camera
-centres too, have orbital height ``a∞ᵀM = 1``; then their differences are displacements, and a translated
-target is the target minus the displacement of the centre, which needs no operator (7.22).
+The three can be executed together: none disturbs the alignment by the others. All points, including the camera centres,
+have orbital height ``a∞ᵀM = 1``; then their differences are displacements, and a translated target is the target minus
+the displacement of the centre, which needs no operator (7.22).
 """
 
 from __future__ import annotations
@@ -28,19 +28,17 @@ from stereoservo.planning.primitives import (
 )
 
 COINCIDENT = 1e-12
-"""Relative length below which two points, or two unit planes, are one: rounding."""
+"""Relative length below which two points, or two unit planes, coincide: rounding."""
 
 FLAT_FACE = 1e-9
 """Sine between two edges of the face, in the frame's coordinates, below which its points are collinear."""
 
 VISIBILITY_SHARE = 0.9
-"""Of the way to where a camera would lose sight of the face, how much a component may plan for."""
+"""Fraction of the amount at which a camera would lose sight of the face that a component may use."""
 
 
 class ComponentStatus(IntEnum):
-    """What became of a component: it moves, has nothing to do, cannot be made by the arm, waits for
-    visibility.
-    """
+    """Status of a component: it moves, is done, cannot be made by the arm, waits for visibility, or has no face."""
 
     MOVES = 0
     DONE = 1
@@ -50,7 +48,9 @@ class ComponentStatus(IntEnum):
 
 
 MOVES, DONE, NOT_REACHABLE, WAITS, NO_FACE = (int(status) for status in ComponentStatus)
-"""As plain numbers, for kernels and the loop: comparing numpy's with an enumeration costs more than the law."""
+"""The statuses as integers, for kernels and the loop: comparing numpy integers with an enumeration takes longer than
+the control law.
+"""
 
 
 class DegenerateFaceError(ValueError):
@@ -59,11 +59,11 @@ class DegenerateFaceError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Component:
-    """One primitive motion of a task, still to be made.
+    """One remaining primitive motion of a task.
 
-    ``amount`` >= 0: τ [length of the centre's displacement in the frame's coordinates] or an angle [rad].
-    ``allowed`` in [0, amount]: how much of it keeps the face visible now. ``screw`` (n,), ``operator`` (4,
-    4): zero where there is nothing to do or nothing that can be done; ``detail`` says why.
+    ``amount`` >= 0: τ [length of the centre's displacement in the frame's coordinates] or an angle [rad]. ``allowed``
+    in [0, amount]: the part of it that currently keeps the face visible. ``screw`` (n,), ``operator`` (4, 4): zero if
+    the component is done or cannot be made; ``detail``: the cause.
     """
 
     amount: float
@@ -93,11 +93,11 @@ def decompose(
     centre_star: FloatArray,
     camera_centres: FloatArray,
 ) -> Decomposition:
-    """Components of the way from points ``A`` (3, 4) to ``A_star`` (3, 4) about ``centre`` (4,) to
-    ``centre_star`` (4,).
+    """Components of the displacement from points ``A`` (3, 4) to ``A_star`` (3, 4), with the centre from ``centre``
+    (4,) to ``centre_star`` (4,).
 
-    ``operators`` (n, 4, 4) at the current configuration. ``camera_centres`` (c, 4), c may be 0: whose sight
-    of the face to keep. All heights 1. Raises DegenerateFaceError. Equations (7.18)–(7.24).
+    ``operators`` (n, 4, 4) at the current configuration. ``camera_centres`` (c, 4), c may be 0: cameras to which the
+    face must stay visible. All heights 1. Raises DegenerateFaceError. Equations (7.18)–(7.24).
     """
     face, face_star = _face(A), _face(A_star)
     freedoms = arm_freedoms(operators)
@@ -116,7 +116,7 @@ def decompose(
         except (NotReachableError, DegenerateStepError) as error:
             translation = _nothing(operators, tau, ComponentStatus.NOT_REACHABLE, str(error))
 
-    # Planes through the centre, parallel to the face: the hinge must hold the centre.
+    # Planes through the centre, parallel to the face: the hinge must contain the centre.
     A_c = A + (centre - A.mean(axis=0))
     A_t = A_star - displacement  # (7.22)
     A_tc = A_t + (centre - A_t.mean(axis=0))
@@ -134,7 +134,7 @@ def decompose(
             hinge = _component(primitive, theta, bound)
             A_r = A_tc @ exp_rotation(primitive.operator, -theta).T  # (7.24)
         except (NotReachableError, DegenerateStepError) as error:
-            # no operator, no measure of the angle: that of the planes' coordinates tells that there is one
+            # without an operator the angle is not known: the angle of the planes' coordinates shows that it is not zero
             angle = math.acos(min(1.0, max(-1.0, float(a @ a_t))))
             hinge = _nothing(operators, angle, ComponentStatus.NOT_REACHABLE, str(error))
 
@@ -171,7 +171,7 @@ def _component(primitive: Primitive, amount: float, bound: float) -> Component:
 
 
 def _positive(primitive: Primitive, theta: float) -> tuple[Primitive, float]:
-    """The sense of the axis is free: the one that makes the angle a distance."""
+    """The primitive with the sense of its axis chosen so that the angle is not negative, and that angle."""
     if theta >= 0.0:
         return primitive, theta
     flipped = Primitive(-primitive.screw, -primitive.operator, primitive.smallest, primitive.second, primitive.largest)
@@ -179,10 +179,10 @@ def _positive(primitive: Primitive, theta: float) -> tuple[Primitive, float]:
 
 
 def _sight(face: FloatArray, face_star: FloatArray, camera_centres: FloatArray) -> tuple[float, FloatArray]:
-    """The sign of the face's visible side, and the cameras that see it now and at the target, times that
+    """The sign of the face's visible side, and the centres of the cameras that see it now and at the target, times that
     sign.
 
-    Which side is printed is taken from the target, which was seen.
+    The printed side is the one that the cameras see at the target.
     """
     if camera_centres.shape[0] == 0:
         return 1.0, camera_centres
@@ -204,10 +204,9 @@ def _translation_bound(face: FloatArray, H_t: FloatArray, centre: FloatArray, se
 
 
 def _hinge_point(a: FloatArray, a_t: FloatArray, centre: FloatArray, A_c: FloatArray) -> FloatArray | None:
-    """A second point of the line in which the two faces meet at the centre; None where they coincide.
+    """A second point of the line in which the two faces meet at the centre; None if they coincide.
 
-    Faces that lie back on face turn half round any line in them: the one to the point farthest from the
-    centre.
+    Opposite faces turn by half a turn about any line in them: the line to the point farthest from the centre is used.
     """
     difference = a_t - (a @ a_t) * a
     length = float(np.linalg.norm(difference))
@@ -223,7 +222,7 @@ def _hinge_point(a: FloatArray, a_t: FloatArray, centre: FloatArray, A_c: FloatA
 def _hinge_angle(H_r: FloatArray, a: FloatArray, a_t: FloatArray) -> float:
     """θ in (−π, π] that turns the oriented plane ``a`` into ``a_t``: ``a(θ) = cos θ a − sin θ Ĥ_rᵀa`` (7.23).
 
-    Oriented planes leave one solution of the two: the other one turns the back-face to the front.
+    With oriented planes only one of the two solutions remains: the other one turns the back of the face to the front.
     """
     u = -H_r.T @ a
     v = H_r.T @ (H_r.T @ a)
@@ -238,17 +237,17 @@ def _planar_angle(H_p: FloatArray, A: FloatArray, A_r: FloatArray) -> float:
 
 
 def _angle(u: FloatArray, v: FloatArray, right: FloatArray) -> float:
-    """``atan2`` of the ``sin θ, cos θ`` that solve ``sin θ u − cos θ v = right`` best."""
+    """``atan2`` of the least-squares solution ``sin θ, cos θ`` of ``sin θ u − cos θ v = right``."""
     uu, vv, uv = float((u * u).sum()), float((v * v).sum()), float((u * v).sum())
     ur, vr = float((u * right).sum()), float((v * right).sum())
     sine = ur * vv - uv * vr
     cosine = uv * ur - uu * vr
-    # both over the determinant uu·vv − uv² > 0
+    # both divided by the determinant uu·vv − uv² > 0
     return math.atan2(sine, cosine)
 
 
 def _front(H: FloatArray, a: FloatArray, eye: FloatArray) -> tuple[float, float, float]:
-    """``k, R, φ`` of ``a(θ)ᵀO = k + R cos(θ − φ)``: the face turned by θ, seen from ``eye``, which stands."""
+    """``k, R, φ`` of ``a(θ)ᵀO = k + R cos(θ − φ)``: the face turned by θ, seen from the static ``eye``."""
     once = H @ eye
     u, v = float(a @ once), float(a @ (H @ once))
     return float(a @ eye) + v, math.hypot(u, v), math.atan2(-u, -v)
@@ -266,11 +265,10 @@ def _visible_sense(
     camera_centres: FloatArray,
     displacement: FloatArray,
 ) -> float:
-    """Choose θ or θ ∓ 2π so that the face shows its front all the way, translation included (7.4.2).
+    """Choose θ or θ ∓ 2π so that the face shows its front during the whole motion, translation included (7.4.2).
 
-    ``φ``: the angle at which the face would front the middle of the cameras. Seen from the face, that turns
-    by the short way while the centre moves; the target angle is the one within a quarter turn of where it
-    ends.
+    ``φ``: the angle at which the face would point to the centroid of the cameras. In the frame of the face, it changes
+    by the smaller angle while the centre moves; the target angle is the one within a quarter turn of its final value.
     """
     if camera_centres.shape[0] == 0:
         return theta
@@ -278,7 +276,7 @@ def _visible_sense(
     _, size, now = _front(H_r, a, middle)
     _, size_then, then = _front(H_r, a, middle - side * displacement)
     if min(size, size_then) <= COINCIDENT * float(np.linalg.norm(middle)):
-        return theta  # the cameras are on the axis: both ways look the same
+        return theta  # the cameras are on the axis: both senses are equivalent
     then = now + _wrapped(then - now)
     return then + _wrapped(theta - then)
 

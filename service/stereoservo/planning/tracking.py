@@ -1,5 +1,5 @@
 """Tracking of a planned path: reference pose, joints and their rates at a given time, and the advance of the plan's
-time, slower when the body lags behind.
+time, which is slower while the body lags behind.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.plan import Plan
 
 FOLLOWS = 0.5
-"""Lag, relative to the largest that is tolerated, up to which the plan goes on at full pace."""
+"""Lag, relative to the largest tolerated one, up to which the plan advances at full pace."""
 
 
 FADE_S = 0.5
-"""Before its end [s]: the time over which a plan's joints lose their say, so that images alone decide at rest."""
+"""Time before a plan's end [s] over which the weight of its joints fades out, so that only the images count at rest."""
 
 
 class PlanSample(NamedTuple):
@@ -33,8 +33,8 @@ class PlanSample(NamedTuple):
 
 
 class PlannedJoints(NamedTuple):
-    """What a plan has the joints do in a step: mean ``rates`` (n,) [rad/s or m/s] over it, ``error`` (n,) planned less
-    present joints at its begin, and ``weight`` [0, 1].
+    """Planned motion of the joints in a step: mean ``rates`` (n,) [rad/s or m/s] over it, ``error`` (n,): planned minus
+    current joints at its start, and ``weight`` [0, 1].
     """
 
     rates: FloatArray
@@ -44,7 +44,9 @@ class PlannedJoints(NamedTuple):
 
 @kernel
 def _pace_at(times: FloatArray, k: int) -> float:
-    """Samples per second at sample ``k``: the mean at two neighbours is one over the time between (`sample_times`)."""
+    """Samples per second at sample ``k``: the mean of two adjacent ones is the inverse of the time between
+    (`sample_times`).
+    """
     before = 0.0
     for i in range(k):
         between = 1.0 / (times[i + 1] - times[i])
@@ -56,7 +58,7 @@ def _pace_at(times: FloatArray, k: int) -> float:
 
 @kernel
 def _rate(pace: float, values: FloatArray, k: int, i: int) -> float:
-    """Rate at sample ``k``, where ``pace`` samples go by a second; 0 at the ends, where the plan rests."""
+    """Rate at sample ``k`` at ``pace`` samples per second; 0 at the ends, where the plan is at rest."""
     if k == 0 or k == values.shape[0] - 1:
         return 0.0
     rate: float = 0.5 * (values[k + 1, i] - values[k - 1, i]) * pace
@@ -95,7 +97,7 @@ def interpolate_into(times: FloatArray, values: FloatArray, t_s: float, out: Flo
 
 
 def sample_plan(plan: Plan, t_s: float) -> PlanSample:
-    """The plan at ``t_s`` [s]; before its begin and after its end it rests there. NaN counts as the begin."""
+    """The plan at ``t_s`` [s]; at rest before its start and after its end. NaN counts as the start."""
     H, H_rate = np.empty(16), np.empty(16)
     n = plan.joints.shape[1]
     joints, joint_rates = np.empty(n), np.empty(n)
@@ -105,9 +107,10 @@ def sample_plan(plan: Plan, t_s: float) -> PlanSample:
 
 
 def planned_joints(plan: Plan, begin_s: float, end_s: float, dt_s: float, joints: FloatArray) -> PlannedJoints:
-    """For an arm at ``joints`` (n,) and a step of ``dt_s`` in which the plan's time goes from ``begin_s`` to ``end_s``.
+    """Planned joint motion of a step of ``dt_s`` in which the plan's time advances from ``begin_s`` to ``end_s``, for
+    an arm at ``joints`` (n,).
 
-    Empty, with weight 0, when the plan is at its end.
+    Empty, with weight 0, at the end of the plan.
     """
     left_s = float(plan.times[-1]) - begin_s
     if not left_s > 0.0:
@@ -117,9 +120,9 @@ def planned_joints(plan: Plan, begin_s: float, end_s: float, dt_s: float, joints
 
 
 def pace(lag: float) -> float:
-    """Share [0, 1] of full pace at ``lag``: how far the body is behind, 1 being the largest that is tolerated.
+    """Fraction [0, 1] of full pace at ``lag``, the lag of the body relative to the largest tolerated one.
 
-    Full up to ``FOLLOWS``, then falling smoothly to a stand at 1. A lag that is not a number stands still.
+    1 up to ``FOLLOWS``, then falling smoothly to 0 at 1; 0 for NaN.
     """
     if not lag < 1.0:
         return 0.0
@@ -128,9 +131,10 @@ def pace(lag: float) -> float:
 
 
 def advance(plan: Plan, t_s: float, dt_s: float, lag: float) -> float:
-    """The plan's time ``dt_s`` later [s]: it waits for a body that lags, so that nothing is fed forward that it misses.
+    """The plan's time ``dt_s`` later [s]: it waits for a body that lags, so that the feedforward does not run ahead of
+    it.
 
-    The rates of `sample_plan` are to be scaled by the same `pace`.
+    The rates of `sample_plan` must be scaled by the same `pace`.
     """
     end = float(plan.times[-1])
     start = t_s if math.isfinite(t_s) else 0.0

@@ -1,8 +1,8 @@
-"""Constraints of a path (image borders, visible faces, depth, joint limits, keep-outs) and the clearance of one pose
-to each of them; also the pull of joints away from their limits.
+"""Constraints of a path (image borders, visible faces, depth, joint limits, keep-outs) and the clearance of one pose to
+each of them; also the pull of joints away from their limits.
 
-Margins hold along the path. Where the present pose or the goal itself has less, they are lowered to that: a pose that
-is allowed may be left and reached.
+Margins apply along the path. If the current pose or the goal itself has less clearance, they are reduced to it, so that
+every allowed pose can be left and reached.
 
 The closest approach to each kind of limit is a row of a table (6, 7): relative clearance, clearance, value, limit,
 index, marker, path parameter; rows in the order of ``KINDS``. Kernels, for the loop.
@@ -32,24 +32,24 @@ KINDS: tuple[Limit, ...] = (
 JOINT_LIMIT, KEEP_OUT, FIELD_OF_VIEW, FACE_HIDDEN, BEHIND_CAMERA, NOT_REACHABLE = range(6)
 
 NEAREST_DEPTH = 0.05
-"""Least depth of a marker, as a path_parameter of the depth that the centre has now."""
+"""Least depth of a marker, as a fraction of the current depth of the centre."""
 ROUNDING = 1e-9
 
 GRAZING = math.radians(3.0)
 """Least elevation of a camera over a face that must stay visible, unless the ends of the path have less."""
 THICK = 0.05
-"""Distance of a body's centroid from a face, relative to the body's size, from which on it tells the face's outside."""
+"""Distance of a body's centroid from a face, relative to the body's size, that determines the outside of the face."""
 YIELD_PX, YIELD_ANGLE = 0.02, 1e-4
-"""What margins leave below what the ends have [px], [rad]: more than the arm may be off there."""
+"""Amount by which reduced margins are below the clearance at the ends [px], [rad]: more than the arm's error there."""
 
 
 class Constraints(NamedTuple):
-    """What a path has to respect, constant while a body moves, in a motion frame.
+    """Constraints of a path, constant while a body moves, in a motion frame.
 
     With c cameras, m markers, f faces, n joints, k keep-outs: ``body`` (m, 3), ``must_stay_visible`` (m,), 1 or 0.
     ``cameras`` (c, 3, 4), ``camera_centres`` (c, 3), ``sizes`` (c, 2) [px], ``lenses`` (c, 4), ``margins`` (c,) [px],
-    ``depths`` (c,) of the centre now. ``faces`` (f, 3), ``sides`` (f, c): the sign of the face's plane at the camera
-    where it must stay visible, else 0; ``grazing`` (f, c): least elevation [rad]. ``lower``, ``upper`` (n,),
+    ``depths`` (c,): current depths of the centre. ``faces`` (f, 3), ``sides`` (f, c): the sign of the face's plane at
+    the camera if it must stay visible, else 0; ``grazing`` (f, c): least elevation [rad]. ``lower``, ``upper`` (n,),
     ``keep_outs`` (k, n, 2).
     """
 
@@ -70,7 +70,7 @@ class Constraints(NamedTuple):
 
 
 def empty_table() -> FloatArray:
-    """A table of closest approaches before any pose: nothing near."""
+    """A table of closest approaches without any pose: all clearances are infinite."""
     table = np.zeros((len(KINDS), 7))
     table[:, :2] = np.inf
     table[:, 5] = -1.0
@@ -78,9 +78,9 @@ def empty_table() -> FloatArray:
 
 
 class Margin(NamedTuple):
-    """How far a pose is from one limit: the ``value`` that has the ``limit``, and the ``clearance`` that is left, all
-    in the limit's unit; the number of the joint, camera or keep-out, ``whose``, and of the ``marker`` that it is of, -1
-    for none; the ``path_parameter`` in [0, 1].
+    """Distance of a pose from one limit: the limited ``value``, the ``limit`` and the ``clearance``, all in the limit's
+    unit; ``whose``: index of the joint, camera or keep-out; ``marker``: index of the marker, -1 for none; the
+    ``path_parameter`` in [0, 1].
     """
 
     value: float
@@ -93,7 +93,7 @@ class Margin(NamedTuple):
 
 @kernel
 def _enter(table: FloatArray, kind: int, scale: float, margin: Margin) -> bool:
-    """Whether a limit of a ``kind`` is broken; the table keeps the closest approach, relative to ``scale``."""
+    """Whether a limit of a ``kind`` is violated; the table holds the closest approach, relative to ``scale``."""
     if margin.clearance / scale < table[kind, 0]:
         table[kind, 0] = margin.clearance / scale
         table[kind, 1] = margin.clearance
@@ -121,7 +121,7 @@ def border_clearance(
 ) -> tuple[float, float]:
     """Distance of a point's raw pixel from the image's border [px], negative outside; and its depth.
 
-    Beyond the lens's fold, or not before the camera, it is as far outside as the image is wide.
+    Beyond the lens's fold, or behind the camera, the distance is minus the image width.
     """
     d = camera[2, 0] * x + camera[2, 1] * y + camera[2, 2] * z + camera[2, 3]
     if not d > 0.0:
@@ -157,9 +157,9 @@ def elevation(points: FloatArray, faces: IntArray, f: int, side: float, camera_c
 def check_view(
     points: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray, bounded: bool
 ) -> int:
-    """The first kind of limit that ``points`` (m, 3) break, or −1; their clearance is entered into the table (6, 7).
+    """The first kind of limit that ``points`` (m, 3) violate, or −1; their clearance is entered into the table (6, 7).
 
-    ``bounded``: with the margins; else those of the images and faces themselves.
+    ``bounded``: with the margins; else the limits of the images and faces themselves.
     """
     s = constraints
     broken = -1
@@ -182,7 +182,7 @@ def check_view(
                 broken = 4
             if broken < 0 and clearance - margin < -ROUNDING * width and depth > 0.0:
                 broken = 2
-        # of each camera the closest one alone can be the closest of all
+        # only the closest marker of each camera can be the closest of all
         depth_margin = Margin(nearest_depth, NEAREST_DEPTH, nearest, c, nearest_marker, path_parameter)
         _enter(table, 4, 1.0, depth_margin)
         left_px = outermost_px - margin if outermost_marker >= 0 else math.inf
@@ -206,7 +206,7 @@ def check_view(
 
 @kernel
 def check_joints(joints: FloatArray, path_parameter: float, constraints: Constraints, table: FloatArray) -> int:
-    """The first kind of limit that ``joints`` (n,) break, or −1; their clearance is entered into the table (6, 7)."""
+    """The first kind of limit that ``joints`` (n,) violate, or −1; their clearance is entered into the table (6, 7)."""
     s = constraints
     n = joints.shape[0]
     broken = -1
@@ -233,8 +233,8 @@ def check_joints(joints: FloatArray, path_parameter: float, constraints: Constra
 def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pull (n,) in [-1, 1] to the middle of each joint's range, and half ranges (n,).
 
-    The cube of the relative distance from the middle; no pull and a half range of 1 where ``lower`` and ``upper`` (n,)
-    are infinite, or leave no range.
+    The cube of the relative distance from the middle; no pull and a half range of 1 if ``lower`` and ``upper`` (n,) are
+    infinite, or their range is empty.
     """
     n = positions.shape[0]
     half = np.ones(n)
@@ -252,7 +252,9 @@ def limit_pull(positions: FloatArray, lower: FloatArray, upper: FloatArray) -> t
 
 
 def writable_copy(values: npt.ArrayLike) -> FloatArray:
-    """A writable, contiguous copy: kernels are compiled by these properties too, and no loop may wait for that."""
+    """A writable, contiguous copy: kernels are also specialised for these properties, and the loop must not wait for
+    compilation.
+    """
     return np.array(values, dtype=np.float64, order="C", copy=True)
 
 
@@ -270,7 +272,7 @@ def in_frame(inverse: FloatArray, points: FloatArray) -> FloatArray:
 def read_constraints(
     request: PlanRequest, frame: FloatArray, camera_centres: FloatArray, body: FloatArray, goal: FloatArray
 ) -> tuple[Constraints, ClosestApproach | None]:
-    """Constraints of a path in the motion ``frame``; and why there can be none: an end of it out of view, or hidden.
+    """Constraints of a path in the motion ``frame``; and the violation if an end of the path is out of view, or hidden.
 
     In the frame: ``camera_centres`` (c, 3), the ``body`` (m, 3) now, the ``goal`` (m, 3).
     """
@@ -290,7 +292,7 @@ def read_constraints(
         faces=faces,
         sides=sides,
         grazing=grazing,
-        # a joint beyond its limit may come back
+        # a joint beyond its limit may return
         lower=writable_copy(np.minimum(limits.position_min, r.joints)),
         upper=writable_copy(np.maximum(limits.position_max, r.joints)),
         keep_outs=writable_copy(limits.keep_outs).reshape(-1, len(r.joints), 2),
@@ -309,7 +311,7 @@ def _moved_camera(P: FloatArray, frame: FloatArray) -> FloatArray:
 
 @kernel
 def _image_clearances(constraints: Constraints, points: FloatArray) -> FloatArray:
-    """Of each camera (c,): the least `border_clearance` of the ``points`` (m, 3) that must stay visible."""
+    """Least `border_clearance` in each camera (c,) of the ``points`` (m, 3) that must stay visible."""
     s = constraints
     clearances = np.full(s.cameras.shape[0], math.inf)
     for c in range(s.cameras.shape[0]):
@@ -324,7 +326,7 @@ def _image_clearances(constraints: Constraints, points: FloatArray) -> FloatArra
 
 @kernel
 def _elevations(points: FloatArray, faces: IntArray, camera_centres: FloatArray) -> FloatArray:
-    """`elevation` (f, c) of every camera over every face, on the side 1."""
+    """`elevation` (f, c) of every camera over every face, on side 1."""
     out = np.empty((faces.shape[0], camera_centres.shape[0]))
     for f in range(faces.shape[0]):
         for c in range(camera_centres.shape[0]):
@@ -336,7 +338,9 @@ def _elevations(points: FloatArray, faces: IntArray, camera_centres: FloatArray)
 def _required_visibility(
     body: FloatArray, goal: FloatArray, faces: IntArray, camera_centres: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Sides (f, c) of the faces and least elevations (f, c) [rad]; side 0 where a camera has no sight at both ends."""
+    """Sides (f, c) of the faces, least elevations (f, c) [rad]; side 0 if a camera does not see the face at both
+    ends.
+    """
     cameras = camera_centres.shape[0]
     sides, grazing = np.zeros((faces.shape[0], cameras)), np.zeros((faces.shape[0], cameras))
     now, then = _elevations(body, faces, camera_centres), _elevations(goal, faces, camera_centres)
@@ -358,7 +362,7 @@ def _required_visibility(
 
 @kernel
 def _extent(body: FloatArray) -> tuple[FloatArray, float]:
-    """Centroid (3,) of the ``body`` (m, 3), and the largest distance from it."""
+    """Centroid (3,) of the ``body`` (m, 3), and the largest distance of a point from it."""
     centroid, largest = np.zeros(3), 0.0
     for p in range(body.shape[0]):
         for i in range(3):
@@ -375,7 +379,7 @@ def _extent(body: FloatArray) -> tuple[FloatArray, float]:
 
 @kernel
 def _outside(body: FloatArray, face: IntArray, centroid: FloatArray, size: float) -> float:
-    """Sign of a face's plane outside a body of that ``centroid`` (3,) and ``size``; 0 where all markers lie in it."""
+    """Sign of a face's plane outside a body of given ``centroid`` (3,) and ``size``; 0 if all markers lie in it."""
     a = body[face[0]]
     u, v = body[face[1]] - a, body[face[2]] - a
     normal = np.array([u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]])

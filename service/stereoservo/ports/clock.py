@@ -18,7 +18,7 @@ class MonotonicClock:
 
 
 class VirtualClock:
-    """A clock that is set by its owner; starts at one second so that 'never' (0) is always old."""
+    """A clock that is set by its owner; it starts at one second, so that the stamp 0 ('never') is always old."""
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
@@ -28,11 +28,11 @@ class VirtualClock:
         return self._now_ns
 
     def advance_to(self, t_ns: int) -> None:
-        """Move to ``t_ns``. Raises ValueError when that lies in the past."""
+        """Set the time to ``t_ns``. Raises ValueError if that is in the past."""
         if t_ns < self._now_ns:
             raise ValueError(f"virtual time cannot run backwards: now {self._now_ns} ns, asked {t_ns} ns")
         self._now_ns = t_ns
 
     def sleep(self, seconds: float) -> None:
-        """Move on by ``seconds``, at least by one nanosecond."""
+        """Advance by ``seconds``, at least by one nanosecond."""
         self._now_ns += max(1, round(seconds * 1e9))

@@ -2,12 +2,11 @@
 (joint states, frames, marker observations) and errors.
 
 All stamps are ``CLOCK_MONOTONIC`` nanoseconds of this host (in lockstep: the virtual clock), taken from
-``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s]
-for revolute and [m], [m/s] for prismatic joints. Pixels: raw ones, those of the
-image; integer = pixel centre.
+``DriverContext.clock``. Every sample carries a stamp and a sequence number. Joint quantities are [rad], [rad/s] for
+revolute and [m], [m/s] for prismatic joints. Pixels are raw image pixels; integer = pixel centre.
 
-Calls are non-blocking within ``call_budget_us`` of the description. ``describe()`` works before anything is
-connected. Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close``.
+Calls are non-blocking within ``call_budget_us`` of the description. ``describe()`` works without a connection.
+Lifecycle: ``configure`` -> ``activate`` -> ``deactivate`` -> ``close``.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ Pacing = Literal["clock", "driver", "lockstep"]
 
 
 class DriverError(Exception):
-    """A driver cannot do what was asked. Carries data; the text has the cause, the value and what would be valid.
+    """A driver cannot execute a request. The message states the cause, the value and the valid values.
 
     Attributes:
         code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
@@ -45,10 +44,10 @@ class DriverError(Exception):
 
 
 class JointSpec(msgspec.Struct, frozen=True):
-    """A joint's name, kind and the machine's limits; the cell's own can only be tighter.
+    """A joint's name, kind and the machine's limits; the limits of the cell can only be tighter.
 
-    ``resolution``: step of its encoder at the joint [rad or m], 0 where it is finer than anything that matters here.
-    Numbers of arrays are taken as plain floats. Raises ValueError where the resolution is negative or not finite.
+    ``resolution``: step of its encoder at the joint [rad or m], 0 if it is negligible. Array scalars are converted to
+    plain floats. Raises ValueError if the resolution is negative or not finite.
     """
 
     name: str
@@ -69,12 +68,12 @@ class JointSpec(msgspec.Struct, frozen=True):
 class JointDriverDescription(msgspec.Struct, frozen=True):
     """The joints, rate and pacing of a joint driver, readable before it is connected.
 
-    ``home``: a configuration in which the arm may well be (in joint order; empty: none is known).
-    ``effort_units``: of ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones.
-    ``simulated``: nothing real moves; then a cell file may leave limits and base out, and has these and ``home``.
-    ``lacks``: which of ``efforts`` and ``following_errors`` its samples do not carry, as far as it is known beforehand.
-    ``auxiliary``: joints and outputs beside them, of an :class:`AuxiliaryDriver`. ``notes``: what the driver takes
-    otherwise than a person may think, such as joints of a file that it leaves out; told where a cell is checked or run.
+    ``home``: a plausible configuration of the arm (in joint order; empty: unknown). ``effort_units``: of
+    ``JointState.efforts``, in joint order; empty: N m of revolute joints, N of prismatic ones. ``simulated``: no real
+    machine moves; a cell file may then omit limits and base, and uses these and ``home``. ``lacks``: which of
+    ``efforts`` and ``following_errors`` are missing in its samples, as far as known in advance. ``auxiliary``:
+    additional joints and outputs, of an :class:`AuxiliaryDriver`. ``notes``: interpretations of the driver that may be
+    unexpected, such as omitted joints of a file; reported when a cell is checked or run.
     """
 
     driver: str
@@ -108,8 +107,8 @@ class CameraDescription(msgspec.Struct, frozen=True):
 class DetectorDescription(msgspec.Struct, frozen=True):
     """The marker ids that a detector can report.
 
-    ``systematic_px``: standard deviation [px] of its errors that do not average out over frames of a scene at rest
-    (sampling, rounding to grey levels); contained in the covariances that it states.
+    ``systematic_px``: standard deviation [px] of its errors that do not average out over frames of a static scene
+    (sampling, rounding to grey levels); included in the covariances that it reports.
     """
 
     detector: str
@@ -118,9 +117,9 @@ class DetectorDescription(msgspec.Struct, frozen=True):
 
 
 class JointState(msgspec.Struct, frozen=True, eq=False):
-    """One joint sample: ``positions`` (n,), ``velocities`` (n,), and, where the drives have them, (n,) each:
-    ``efforts`` [N m or N; shares of the rated torque where the driver does not know that] and ``following_errors``,
-    set less actual position [rad or m].
+    """One joint sample: ``positions`` (n,), ``velocities`` (n,), and, if the drives report them, (n,) each: ``efforts``
+    [N m or N; fractions of the rated torque if the driver does not know that] and ``following_errors``, set minus
+    actual position [rad or m].
     """
 
     seq: int
@@ -189,10 +188,11 @@ class Clock(Protocol):
 
 @dataclass(frozen=True)
 class DriverContext:
-    """Context of a driver, given to its constructor beside its own options.
+    """Context of a driver, passed to its constructor with the driver's options.
 
-    ``camera``: of a camera driver or detector, as the cell file has it. ``mount``: of the cell's cameras. ``arm``: what
-    the cell file says of a simulated arm (`messages.cell_file.CellFile.arm_options`), for the cameras that see it.
+    ``camera``: name of the camera of a camera driver or detector, as in the cell file. ``mount``: of the cell's
+    cameras. ``arm``: description of a simulated arm in the cell file (`messages.cell_file.CellFile.arm_options`), for
+    the cameras that see it.
     """
 
     clock: Clock
@@ -218,8 +218,8 @@ class JointDriver(Protocol):
         ...
 
     def configure(self) -> None:
-        """Connect and check the machine; connected already (after deactivate), check it anew and clear what faults are
-        cleared. Raises DriverError. Nothing moves.
+        """Connect and check the machine; if already connected (after deactivate), check it again and reset the faults
+        that can be reset. Raises DriverError. Nothing moves.
         """
         ...
 
@@ -240,8 +240,8 @@ class JointDriver(Protocol):
         ...
 
     def deactivate(self) -> None:
-        """Stop, then power off, but for an arm without brakes that would fall: its motors hold it on. Commands are
-        refused from now on. Idempotent.
+        """Stop, then power off, except for an arm without brakes that would fall: its motors continue to hold it. Later
+        commands are refused. Idempotent.
         """
         ...
 
@@ -255,8 +255,8 @@ class AuxiliaryDriver(Protocol):
     """A joint driver with auxiliary joints (a gripper) or digital outputs; ``stop`` stops these joints, too."""
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Order positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name. Does not block; the
-        driver moves a joint there at its own velocity. Raises DriverError unless active.
+        """Command positions of auxiliary joints [rad or m] and digital outputs (0 or 1) by name. Does not block; the
+        driver moves each joint at its own velocity. Raises DriverError unless active.
         """
         ...
 
@@ -265,15 +265,15 @@ class AuxiliaryDriver(Protocol):
         ...
 
     def stop_auxiliary(self) -> None:
-        """Hold auxiliary joints where they are; outputs keep their state. Any state, never raises."""
+        """Hold auxiliary joints at their current positions; outputs keep their state. Any state, never raises."""
         ...
 
 
 class ExaminationFinding(msgspec.Struct, frozen=True):
-    """One result of an examination of a cell. ``ok``: passed, failed, or None for a remark without a verdict.
+    """One result of an examination of a cell. ``ok``: passed, failed, or None for a remark without a result.
 
-    ``remedy``: the setting or act that removes the cause; ``cure`` in JSON. ``jogged``: the joint moved for it, and
-    its travel by its encoder [rad or m].
+    ``remedy``: the setting or action that removes the cause; ``cure`` in JSON. ``jogged``: the joint that was moved,
+    and its travel by its encoder [rad or m].
     """
 
     name: str
@@ -284,8 +284,9 @@ class ExaminationFinding(msgspec.Struct, frozen=True):
 
 
 MayMove = Callable[[str], float]
-"""Asked, with a question for a person, before a joint is moved: the share of the usual jog (one degree, 2 mm) that is
-allowed, up to 1; 0 or False: none."""
+"""Function called with a question for the operator before a joint is moved; returns the allowed fraction of the usual
+jog (one degree, 2 mm), up to 1; 0 or False: no motion.
+"""
 
 
 @runtime_checkable
@@ -293,9 +294,9 @@ class ExaminableJointDriver(Protocol):
     """A joint driver that can examine its machine for `stereoservo doctor`; the driver is not configured then."""
 
     def examine(self, may_move: MayMove) -> Iterator[ExaminationFinding]:
-        """Findings on the machine: connect, examine, release. ``may_move`` is asked before any joint is moved.
+        """Findings on the machine: connect, examine, release. ``may_move`` is called before any joint is moved.
 
-        Never raises on what the machine does: a failure is a finding.
+        Never raises for faults of the machine: a failure is a finding.
         """
         ...
 
@@ -309,7 +310,7 @@ class CameraDriver(Protocol):
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None: ...
 
     def describe(self) -> CameraDescription:
-        """Size, rate, what it delivers; works unconnected."""
+        """Size, rate, kind of data; works unconnected."""
         ...
 
     def configure(self) -> None:
@@ -334,12 +335,13 @@ class CameraDriver(Protocol):
 
 
 class CameraStatistics(msgspec.Struct, frozen=True):
-    """Counts of a camera driver since ``activate``: ``frames`` received, ``dropped`` ones that never arrived (gaps
-    of its sequence or its grid), ``frozen`` ones withheld because they repeat the previous one, ``reconnects``.
+    """Counts of a camera driver since ``activate``: ``frames`` received, ``dropped`` ones that never arrived (gaps of
+    its sequence numbers or its time grid), ``frozen`` ones discarded because they repeat the previous one,
+    ``reconnects``.
 
     ``settings``: requested and reported settings of the source by name, e.g. ``{"exposure": (10.0, 12.0)}``.
-    ``server_clock``: whether the clock of a server on another host is known, and what is known of it or why it is not;
-    None where its stamps are not used.
+    ``server_clock``: whether the clock of a server on another host is known, with details or the reason; None if its
+    stamps are not used.
     """
 
     frames: int = 0
@@ -376,6 +378,6 @@ class Detector(Protocol):
 
 @runtime_checkable
 class ExplainingDetector(Protocol):
-    """A detector that tells of the newest frame why markers are not reported, by id; -1: why none is."""
+    """A detector that reports, for the newest frame, why markers are not detected, by id; -1: why none is."""
 
     refused: dict[int, str]

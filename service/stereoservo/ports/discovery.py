@@ -1,5 +1,5 @@
-"""What drivers find of the hardware of a computer, for `stereoservo setup`: records, and protocols of the drivers that
-can look. A driver class that has the methods is asked; the others are set up by their options alone.
+"""Discovery of the hardware of a computer by drivers, for `stereoservo setup`: records, and protocols of the drivers
+that support it. Discovery uses each driver class that has the methods; the others are set up by their options only.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from stereoservo.ports.devices import ExaminationFinding, JointKindName
 
 
 class FoundCamera(msgspec.Struct, frozen=True):
-    """A camera that a computer has: its name for people, the driver's options that choose it, its picture sizes with
-    rates ``(width [px], height [px], rate [Hz])``, best first; none where it must be opened to know.
+    """A camera of a computer: its display name, the driver's options that select it, its image sizes with rates
+    ``(width [px], height [px], rate [Hz])``, best first; empty if the camera must be opened to know them.
     """
 
     name: str
@@ -23,16 +23,16 @@ class FoundCamera(msgspec.Struct, frozen=True):
 
 
 class FoundBus(msgspec.Struct, frozen=True):
-    """An adapter or serial port that a bus of drives may be behind: its name for people, and the driver's options."""
+    """An adapter or serial port that may lead to a bus of drives: its display name, and the driver's options."""
 
     name: str
     options: dict[str, Any]
 
 
 class FoundDrive(msgspec.Struct, frozen=True):
-    """A drive on a bus. ``address``: its number there. ``options``: what it tells of itself under the names of the
-    driver's options of a joint (identity, counts). ``limits``: its own limits of the position [counts]; None: it has
-    none. ``position`` [counts]; None: not told.
+    """A drive on a bus. ``address``: its number on the bus. ``options``: the data that it reports (identity, counts),
+    by the names of the driver's joint options. ``limits``: its position limits [counts]; None: it has none.
+    ``position`` [counts]; None: not reported.
     """
 
     address: int
@@ -43,7 +43,7 @@ class FoundDrive(msgspec.Struct, frozen=True):
 
 
 class BusScan(msgspec.Struct, frozen=True):
-    """Result of a scan: the bus's options by which drives answered, the drives by address, and what is wrong."""
+    """Result of a scan: the bus options for which drives answered, the drives by address, and the faults."""
 
     options: dict[str, Any]
     drives: tuple[FoundDrive, ...]
@@ -51,7 +51,7 @@ class BusScan(msgspec.Struct, frozen=True):
 
 
 class JointChoice(msgspec.Struct, frozen=True):
-    """What a person has said of the joint that a drive moves, base first [rad, s; m for prismatic joints].
+    """The operator's description of the joint that a drive moves, base first [rad, s; m for prismatic joints].
 
     ``counts_per_rev``: of the motor; ``gear_ratio``: motor turns per joint turn, or per metre;
     ``velocity_units_per_rev_s``: the drive's velocity at one motor turn a second, None: counts/s. ``low``, ``high``,
@@ -75,12 +75,12 @@ class CameraFinder(Protocol):
 
     @classmethod
     def find_cameras(cls) -> tuple[FoundCamera, ...]:
-        """Cameras of this computer; those on a network are not looked for. Opens none for longer than a question."""
+        """Cameras of this computer; network cameras are not searched for. Cameras are opened only briefly."""
         ...
 
     @classmethod
     def probe_camera(cls, options: Mapping[str, Any]) -> tuple[int, int, float]:
-        """Open a source by ``options`` and look at its pictures: width, height [px] and rate [Hz] that it delivers.
+        """Open a source by ``options`` and measure its images: returns width, height [px] and rate [Hz].
 
         Raises DriverError.
         """
@@ -98,13 +98,13 @@ class DriveFinder(Protocol):
 
     @classmethod
     def scan_bus(cls, options: Mapping[str, Any]) -> BusScan:
-        """Ask a bus, whose ``options`` need not name any joint, which drives are on it; nothing is written to a drive.
+        """Find the drives on a bus, whose ``options`` need not name any joint; nothing is written to a drive.
 
-        Raises DriverError where the bus cannot be opened, or is lost.
+        Raises DriverError if the bus cannot be opened, or is lost.
         """
         ...
 
     @classmethod
     def options_of(cls, scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, Any]:
-        """The driver's options, ``[joints.options]`` of a cell file, for drives that a scan has found."""
+        """The driver's options, ``[joints.options]`` of a cell file, for drives that a scan found."""
         ...

@@ -1,11 +1,10 @@
-"""Layout of self-identifying planar dot patterns (seven dots a face) as pure data, shared by the detector, the
+"""Layout of self-identifying planar dot patterns (seven dots per face) as pure data, shared by the detector, the
 simulation and the plate printer.
 
-A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on
-the edge from corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly
-collinear, and the edge dot's fraction together with the two inner dots distinguishes the faces. A detector
-may use the pattern of *one face* up to scale; how the faces are joined to a body is known only to
-the simulation's truth.
+A face carries seven white dots on black: four corners in clockwise order as the viewer sees them, one on the edge from
+corner 0 to corner 1, and two inside. No three of them but the edge triple are nearly collinear, and the edge dot's
+fraction together with the two inner dots distinguishes the faces. A detector may use the pattern of *one face* up to
+scale; the arrangement of the faces on a body is known only to the ground truth of the simulation.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ INNER = (5, 6)
 class DotFace:
     """One planar face with seven dots.
 
-    ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen
-    from in front. Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids`` name the
-    rows. ``radius`` [m] of a dot, ``half_side`` [m] of the black square around them.
+    ``positions`` (7, 2) [m] in face coordinates: origin in the middle, x to the right and y down as seen from in front.
+    Rows: corners 0..3 clockwise, the dot on edge 0-1, two inner dots. ``ids``: of the rows. ``radius`` [m] of a dot,
+    ``half_side`` [m] of the black square around them.
     """
 
     name: str
@@ -46,12 +45,10 @@ def seven_dots(
     radius: float = 0.008,
     margin: float = 0.018,
 ) -> DotFace:
-    """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from
-    corner 0.
+    """A face from fractions of its corner square: ``edge_fraction`` along edge 0-1, ``inner`` (x, y) from corner 0.
 
-    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots: a detector judges the noise
-    and the black level there, so leave it ten pixels. Ids are
-    ``first_id`` .. ``first_id + 6``.
+    ``side`` [m] between corner dots, ``margin`` [m] of black outside the dots: a detector estimates the noise and the
+    black level there, so it should be ten pixels wide. Ids are ``first_id`` .. ``first_id + 6``.
     """
     fractions = np.array([(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0), (edge_fraction, 0.0), *inner])
     return DotFace(
@@ -86,10 +83,10 @@ MORE: tuple[DotFace, ...] = (
     seven_dots("l", 77, 0.62, ((0.73, 0.52), (0.15, 0.28))),
     seven_dots("m", 84, 0.4, ((0.27, 0.86), (0.45, 0.32))),
 )
-"""Further faces for bodies of one's own, ids from 28. Six dots of one laid on dots of another, or of itself, or of the
-mirror image of any, by any homography, miss by 0.07 of half the corner distance or more (found by random search; held
-by an exhaustive test).
+"""Further faces for the user's own bodies, ids from 28. If six dots of one face are mapped by any homography to dots of
+another, of itself, or of the mirror image of any, the error is 0.07 of half the corner distance or more (found by
+random search; verified by an exhaustive test).
 """
 
 FACES: dict[str, DotFace] = {face.name: face for face in (*DEFAULT_BODY, *WORKPIECE, *MORE)}
-"""Every face there is, by name."""
+"""All faces by name."""

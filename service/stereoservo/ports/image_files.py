@@ -1,8 +1,8 @@
 """Reader and writer of recorded images: ``NAME.avi`` (FFV1, gray, lossless) with stamps and CRCs in ``NAME.jsonl``.
 
-FFV1 with flipped bytes decodes silently into other pixels; only the CRC of every frame's pixels shows it. The sidecar
-is JSON Lines: a header, a line a frame, written after its frame, and an end line, which a recording whose process was
-killed lacks. Such a recording is read as far as video and sidecar both go.
+FFV1 with flipped bytes decodes into wrong pixels without an error; only the CRC of each frame's pixels detects it. The
+sidecar is JSON Lines: a header, one line per frame, written after its frame, and an end line, which is missing if the
+process was killed. Such a recording is read up to the end of the shorter of video and sidecar.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ CODEC = "FFV1"
 SIDECAR = ".jsonl"
 LONGEST_LINE = 4096
 MOST_SURPLUS = 1000
-"""Frames without a line are counted up to here."""
+"""Largest number of frames without a line that are counted."""
 SLOWEST_MS = 10_000
-"""A file that gives no frame for so long, for example one with a hole of gigabytes, is taken to end there."""
+"""Time without a frame after which a file counts as ended [ms], for example one with a hole of gigabytes."""
 GIB = 1 << 30
 
 
 class ImageFileError(Exception):
-    """A recorded camera cannot be written or read: names the file, the frame, the cause, and what to do.
+    """A recorded camera cannot be written or read: the message names the file, the frame, the cause and the remedy.
 
     Attributes:
         code: ``exists``, ``limit``, ``disk``, ``frame``, ``order``, ``closed``, ``codec`` of a writer; ``missing``,
             ``no_sidecar``, ``foreign_sidecar``, ``sidecar``, ``video``, ``size``, ``crc``, ``camera`` of a reader.
-        frame: number of the frame in the file, from 0; None where it is not about one.
+        frame: number of the frame in the file, from 0; None if the error does not concern a frame.
     """
 
     def __init__(self, path: Path, code: str, message: str, *, frame: int | None = None, **data: Any) -> None:
@@ -54,9 +54,10 @@ class ImageFileError(Exception):
 
 
 class ImageHeader(msgspec.Struct, frozen=True, tag="header", tag_field="line"):
-    """First line of the sidecar. ``clock``: of the stamps, which compare only within the same ``boot`` of the host.
+    """First line of the sidecar. ``clock``: of the stamps, which can be compared only within the same ``boot`` of the
+    host.
 
-    ``width``, ``height``: of the pictures; the video's are rounded up to even numbers.
+    ``width``, ``height``: of the images [px]; those of the video are rounded up to even numbers.
     """
 
     schema: str
@@ -73,7 +74,7 @@ class ImageHeader(msgspec.Struct, frozen=True, tag="header", tag_field="line"):
 class ImageLine(msgspec.Struct, frozen=True, tag="frame", tag_field="line", omit_defaults=True):
     """One frame: number in the file, sequence of its source, stamps, CRC-32 of its pixels row by row.
 
-    ``left_out``: frames that the camera delivered just before it and the recording had to leave out.
+    ``left_out``: number of frames delivered by the camera directly before it and omitted by the recording.
     """
 
     frame: int
@@ -85,7 +86,7 @@ class ImageLine(msgspec.Struct, frozen=True, tag="frame", tag_field="line", omit
 
 
 class ImageEnd(msgspec.Struct, frozen=True, tag="end", tag_field="line"):
-    """Last line of a recording that was closed: number of frames, number left out, and why it ended."""
+    """Last line of a closed recording: number of frames, number of omitted frames, and the reason for its end."""
 
     frames: int
     left_out: int
@@ -94,9 +95,7 @@ class ImageEnd(msgspec.Struct, frozen=True, tag="end", tag_field="line"):
 
 @dataclass(frozen=True)
 class ImageLimits:
-    """Limits at which a recording ends: size of the video, time between first and last frame, disk space to leave
-    free.
-    """
+    """Limits of a recording: size of the video, time between first and last frame, disk space to keep free."""
 
     max_bytes: int = 64 * GIB
     max_seconds: float = 4 * 3600.0
@@ -109,7 +108,7 @@ _decoder = msgspec.json.Decoder(ImageHeader | ImageLine | ImageEnd)
 
 
 def _decode(data: bytes) -> ImageHeader | ImageLine | ImageEnd:
-    """A line of a sidecar. Raises ValueError, whatever the bytes."""
+    """A line of a sidecar. Raises ValueError for any invalid bytes."""
     with decoding(ValueError):
         line: ImageHeader | ImageLine | ImageEnd = _decoder.decode(data)
     return line
@@ -121,9 +120,7 @@ def crc_of(image: ImageArray) -> int:
 
 
 def boot_id() -> str:
-    """Id of the host's current boot, from which the monotonic clock counts; empty where the system does not report
-    it.
-    """
+    """Id of the host's current boot, the origin of the monotonic clock; empty if the system does not report it."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     except OSError:
@@ -138,8 +135,8 @@ def sidecar_of(video: Path) -> Path:
 class ImageWriter:
     """Writes one camera's frames. Not thread-safe.
 
-    What was appended survives the end of the process, but for what the container's writer still holds: the last
-    256 KiB of the video at most.
+    Appended frames survive the end of the process, except those in the buffer of the container's writer: at most the
+    last 256 KiB of the video.
     """
 
     def __init__(
@@ -152,7 +149,9 @@ class ImageWriter:
         driver: str = "",
         limits: ImageLimits = DEFAULT_LIMITS,
     ) -> None:
-        """``size``: width, height [px]. Raises ImageFileError (``exists``, ``disk``, ``codec``), makes no directory."""
+        """``size``: width, height [px]. Raises ImageFileError (``exists``, ``disk``, ``codec``); creates no
+        directory.
+        """
         self.path = video
         self.frames = 0
         self.left_out = 0
@@ -188,10 +187,10 @@ class ImageWriter:
             )
 
     def append(self, frame: Frame, left_out: int = 0) -> None:
-        """Add a frame; ``left_out``: how many delivered ones before it are missing.
+        """Add a frame; ``left_out``: number of delivered frames before it that are missing.
 
-        Raises ImageFileError: ``limit``, ``disk`` (nothing more can be added, close it), ``frame`` (its size or type),
-        ``order`` (its stamp is not after the last one's), ``closed``.
+        Raises ImageFileError: ``limit``, ``disk`` (no more frames can be added; close the writer), ``frame`` (wrong
+        size or type), ``order`` (its stamp is not after the previous one), ``closed``.
         """
         image = frame.image
         if self._closed:
@@ -229,7 +228,7 @@ class ImageWriter:
         self.left_out += left_out
 
     def _even(self, image: ImageArray) -> ImageArray:
-        """The picture as the codec takes it: width and height even."""
+        """The image padded to even width and height, as the codec requires."""
         if self._padded is None:
             return np.ascontiguousarray(image)
         self._padded[: self._height, : self._width] = image
@@ -240,7 +239,7 @@ class ImageWriter:
         """Size of the video so far."""
         try:
             return self.path.stat().st_size
-        except OSError:  # the container's writer makes the file at its first flush
+        except OSError:  # the container's writer creates the file at its first flush
             return 0
 
     def _check_room(self, coming: int) -> None:
@@ -282,7 +281,7 @@ class ImageWriter:
     def close(self, why: str = "ended", left_out: int = 0) -> None:
         """Finish both files; ``left_out``: delivered frames after the last one. Idempotent.
 
-        Raises ImageFileError (``disk``) where the end cannot be written; what was appended is readable all the same.
+        Raises ImageFileError (``disk``) if the end cannot be written; the appended frames are readable nevertheless.
         """
         if self._closed:
             return
@@ -297,7 +296,7 @@ class ImageWriter:
         except OSError as error:
             raise ImageFileError(self.path, "disk", f"cannot be finished: {error.strerror}") from error
         finally:
-            with suppress(OSError):  # reported already: by the line that could not be written
+            with suppress(OSError):  # already reported for the line that could not be written
                 self._sidecar.close()
 
     def __enter__(self) -> ImageWriter:
@@ -319,12 +318,12 @@ def _open_sidecar(path: Path) -> IO[bytes]:
 class ImageReader:
     """Reads one camera's recording frame by frame, each checked by its CRC; memory does not grow with the file.
 
-    ``header``: its first line. Once ``read`` has given None: ``lost``, frames that are in only one of the files, and
-    ``end``, the last line (None: the recording was not closed).
+    ``header``: its first line. After ``read`` has returned None: ``lost``, number of frames that are in only one of the
+    files, and ``end``, the last line (None: the recording was not closed).
     """
 
     def __init__(self, video: Path, camera: str = "") -> None:
-        """``camera``: of which it must be, where given.
+        """``camera``: expected camera name, if given.
 
         Raises ImageFileError: ``missing``, ``no_sidecar``, ``foreign_sidecar``, ``video``, ``size``, ``camera``.
         """
@@ -373,7 +372,7 @@ class ImageReader:
     def read(self) -> Frame | None:
         """The next frame, None at the end.
 
-        Raises ImageFileError: ``crc`` (the pixels are not those that were recorded), ``sidecar`` (a damaged line).
+        Raises ImageFileError: ``crc`` (the pixels differ from the recorded ones), ``sidecar`` (a damaged line).
         """
         line, image = self._next(decode=True)
         if line is None or image is None:
@@ -417,7 +416,7 @@ class ImageReader:
         return line, image
 
     def _line(self) -> ImageLine | None:
-        """The next frame's line; None at the end line, at the end of the file, or where its last line is cut off."""
+        """The next frame's line; None at the end line, at the end of the file, or at a truncated last line."""
         data = self._sidecar.readline(LONGEST_LINE)
         if not data:
             return None
@@ -425,7 +424,7 @@ class ImageReader:
             line = _decode(data)
         except ValueError as error:
             if not data.endswith(b"\n") and len(data) < LONGEST_LINE:
-                return None  # the last line, cut off: the process was killed, or the copy ended early
+                return None  # truncated last line: the process was killed, or the copy ended early
             raise self._damaged(f"its line is not valid ({error})") from error
         if isinstance(line, ImageEnd):
             self.end = line
@@ -448,7 +447,7 @@ class ImageReader:
         )
 
     def _lines_left(self) -> int:
-        """Frames that the sidecar has beyond the one just read; reads it to its end."""
+        """Number of frames in the sidecar after the one just read; reads it to its end."""
         count = 0
         first = self.frame
         self.frame += 1
@@ -461,7 +460,7 @@ class ImageReader:
         return count
 
     def _surplus(self) -> int:
-        """Pictures of the video beyond the sidecar's last line, up to ``MOST_SURPLUS``."""
+        """Number of images of the video after the sidecar's last line, up to ``MOST_SURPLUS``."""
         count = 0
         while self._capture is not None and count < MOST_SURPLUS and self._capture.grab():
             count += 1
@@ -520,7 +519,7 @@ def _open_header(path: Path, video: Path) -> tuple[IO[bytes], ImageHeader]:
 def image_lines(video: Path) -> Iterator[ImageLine]:
     """Frames that a recording's sidecar lists, in order; the video is not read.
 
-    Ends at the first line that is none: what comes before it holds. Raises ImageFileError (``no_sidecar``,
+    Ends at the first invalid line; the lines before it are valid. Raises ImageFileError (``no_sidecar``,
     ``foreign_sidecar``).
     """
     file, _ = _open_header(sidecar_of(video), video)

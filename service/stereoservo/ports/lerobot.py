@@ -1,6 +1,6 @@
-"""Reader of LeRobot data sets (formats 2.0, 2.1 and 3.0: parquet tables, and videos or pictures in them):
-docs/recordings.md has what is read of them. What else reading raises than DataSetError is the ModuleNotFoundError of
-the extra ``lerobot``.
+"""Reader of LeRobot data sets (formats 2.0, 2.1 and 3.0: parquet tables, and videos or images in them);
+docs/recordings.md lists the data that are read. Besides DataSetError, functions raise only ModuleNotFoundError, if the
+extra ``lerobot`` is not installed.
 """
 
 from __future__ import annotations
@@ -27,36 +27,36 @@ VERSIONS = ("v2.0", "v2.1", "v3.0")
 STATE = "observation.state"
 IMAGES = ("observation.image", "observation.image.", "observation.images.")
 LEFT_OUT = "none"
-"""Unit of a state that is no joint of the arm, such as a gripper's."""
+"""Unit of a state that is not a joint of the arm, such as a gripper's."""
 UNITS: dict[str, tuple[JointKindName, float]] = {
     "rad": ("revolute", 1.0),
     "deg": ("revolute", math.pi / 180.0),
     "m": ("prismatic", 1.0),
     "mm": ("prismatic", 1e-3),
 }
-"""Units of joints: the kind of such a joint, and the unit's size [rad or m]."""
+"""Units of joints: joint kind, and size of the unit [rad or m]."""
 MOST_COUNTED = 2**40
-"""Number of a frame or an episode at most."""
+"""Largest number of a frame or an episode."""
 MOST_STATES = 4096
 LARGEST_STAMP_S = 1e6
 MOST_NAMED = 20
-"""Episodes that a refusal names."""
+"""Largest number of episodes that an error message lists."""
 
 CELLS = 16
-"""Pictures of a table that are read at a time, within a group of rows (LeRobot's: an episode)."""
+"""Number of images of a table that are read at a time, within a row group (in LeRobot: an episode)."""
 NEAR = 0.25
-"""How far a picture may be from its time, in periods of the data set. LeRobot's own reader allows 0.1 ms."""
+"""Largest deviation of an image from its time, in periods of the data set. LeRobot's own reader allows 0.1 ms."""
 MOST_REORDERED = 16
-"""Frames by which decoding may run ahead of the order of pictures, of any codec."""
+"""Largest number of frames by which decoding order may differ from display order, for all codecs."""
 
 Picture = Callable[[], ImageArray]
-"""Decodes a picture ``(height, width[, 3])``, blue first; to be called before the next one is asked for. Raises
-DataSetError.
+"""Function that decodes an image ``(height, width[, 3])``, BGR; must be called before the next image is requested.
+Raises DataSetError.
 """
 
 
 class DataSetError(Exception):
-    """A data set, or what is asked of one, cannot be used. ``code``: ``dataset`` or ``units``."""
+    """A data set, or a request for its data, cannot be used. ``code``: ``dataset`` or ``units``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -64,8 +64,8 @@ class DataSetError(Exception):
 
 
 class Feature(msgspec.Struct):
-    """An entry of ``features``: its ``dtype``, ``shape`` and the ``names`` of its parts, as data sets have them, and
-    what is known of a video, in ``info`` or, in older sets, ``video_info``.
+    """An entry of ``features``: its ``dtype``, ``shape`` and the ``names`` of its components, in the data set's format,
+    and the properties of a video, in ``info`` or, in older sets, ``video_info``.
     """
 
     dtype: str
@@ -76,7 +76,7 @@ class Feature(msgspec.Struct):
 
 
 class Info(msgspec.Struct):
-    """What is read of ``meta/info.json``."""
+    """The fields of ``meta/info.json`` that are read."""
 
     codebase_version: str
     fps: float
@@ -95,7 +95,7 @@ class EpisodeRows(NamedTuple):
 
 
 class _Wanted(NamedTuple):
-    """A picture of a video: its time in the file, and the ``row`` that it is of."""
+    """An image of a video: its time in the file, and its ``row``."""
 
     at_s: float
     row: int
@@ -106,16 +106,16 @@ def is_data_set(folder: Path) -> bool:
     return (folder / INFO).is_file()
 
 
-# -- what the data set is of ----------------------------------------------------------------------------------
+# -- contents of the data set ---------------------------------------------------------------------------------
 
 
 def _reading(what: Path | str) -> AbstractContextManager[None]:
-    """Boundary around a decoder of ``what``: what it raises becomes a DataSetError."""
+    """Context manager around a decoder of ``what``: converts its exceptions to DataSetError."""
     return decoding(lambda cause: DataSetError("dataset", f"{what}: {cause}"), (DataSetError,))
 
 
 def read_info(folder: Path) -> Info:
-    """What ``meta/info.json`` says. Raises DataSetError."""
+    """The content of ``meta/info.json``. Raises DataSetError."""
     path = folder / INFO
     if not is_data_set(folder):
         raise _wrong(folder, f"there is no file {INFO}; a LeRobot data set has one")
@@ -132,7 +132,7 @@ def read_info(folder: Path) -> Info:
 
 
 def state_names(info: Info, folder: Path) -> list[str]:
-    """Names of the parts of ``observation.state``; ``state0`` and so on where it has none, or two have one name.
+    """Names of the parts of ``observation.state``; ``state0`` and so on if it has none, or if names are not unique.
     Raises DataSetError.
     """
     feature = info.features.get(STATE)
@@ -161,7 +161,7 @@ def _flat(names: Any, deep: int = 3) -> list[str]:
 def joints_of(
     states: Sequence[str], units: str | None
 ) -> tuple[tuple[str, ...], tuple[JointKindName, ...], FloatArray, list[int]]:
-    """Names, kinds and scales (n,) of those states that are joints, and their columns, as ``units`` say. Raises
+    """Names, kinds and scales (n,) of the states that are joints by ``units``, and their columns. Raises
     DataSetError.
     """
     valid = f"{', '.join(UNITS)}, with a factor (deg*0.9 of what counts from -100 to 100), or {LEFT_OUT}"
@@ -206,8 +206,9 @@ def _positive(text: str) -> bool:
 
 
 def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = None) -> dict[str, str]:
-    """By name the features of all cameras, or of those ``wanted`` by name or feature. A camera is named by what follows
-    ``observation.images.``; others, and two of which that is the same, by the whole features. Raises DataSetError.
+    """Features of all cameras by name, or of those ``wanted`` by name or feature. The name of a camera is the part
+    after ``observation.images.``; for other features, and if two of these names are equal, it is the whole feature.
+    Raises DataSetError.
     """
     keys = [
         key for key, feature in info.features.items() if feature.dtype in ("video", "image") and not _of_depth(feature)
@@ -235,10 +236,10 @@ def _of_depth(feature: Feature) -> bool:
 
 
 def _tables(folder: Path, part: str, columns: list[str], episode: int | None = None) -> dict[Path, Mapping[str, Any]]:
-    """Columns of all parquet files of a part of a data set, or of the rows of one ``episode``, as lists by name.
+    """Columns of all parquet files of a part of a data set, or only the rows of one ``episode``, as lists by name.
     Raises DataSetError.
     """
-    from pyarrow import compute  # an extra of its own: see missing_extra
+    from pyarrow import compute  # of a separate extra: see missing_extra
 
     found, episodes = {}, set()
     for path in sorted((folder / part).glob("chunk-*/*.parquet")):
@@ -260,7 +261,7 @@ def _tables(folder: Path, part: str, columns: list[str], episode: int | None = N
 
 
 def _table(folder: Path, path: Path, columns: list[str]) -> Any:
-    """A parquet file that has these ``columns``, read piece by piece. Raises DataSetError."""
+    """A parquet file that has these ``columns``, read in pieces. Raises DataSetError."""
     from pyarrow import parquet
 
     if not path.is_file():
@@ -280,7 +281,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
-    """Rows of all episodes, or of that one ``only``. Raises DataSetError."""
+    """Rows of all episodes, or of the episode ``only``. Raises DataSetError."""
     states = len(state_names(info, folder))
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
     tables = _tables(folder, "data", needed, only).values()
@@ -311,15 +312,13 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
     return EpisodeRows(episode, frame, stamp, state[order])
 
 
-# -- pictures -------------------------------------------------------------------------------------------------
+# -- images ---------------------------------------------------------------------------------------------------
 
 
 def pictures(
     folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False
 ) -> Generator[tuple[int, Picture], None, None]:
-    """Rows, each one of ``every``, and their pictures of one camera, in ``gray`` where that is asked for. Raises
-    DataSetError.
-    """
+    """Every ``every``-th row and its image of one camera, in ``gray`` if requested. Raises DataSetError."""
     kept = range(0, len(rows.stamp), every)
     if info.features[key].dtype == "image":
         yield from _stored_pictures(folder, key, rows, kept, gray=gray)
@@ -373,8 +372,8 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 def _decoded(
     path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, *, gray: bool
 ) -> Iterator[tuple[int, Picture]]:
-    """Pictures of a video at their times. Raises DataSetError where it cannot be decoded or has none at one of them."""
-    if not os.path.isfile(path):  # also of a name that the system does not take
+    """Images of a video at their times. Raises DataSetError if it cannot be decoded or has no image at one of them."""
+    if not os.path.isfile(path):  # also for a name that the system does not accept
         raise DataSetError("dataset", f"{path}: no such video")
     frames = _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
     last_s, (now_s, frame) = None, next(frames, (math.inf, None))
@@ -399,7 +398,7 @@ def _decoded(
 
 
 def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
-    """Times [s] and frames of a video, from a key frame at ``from_s`` or before on."""
+    """Times [s] and frames of a video, starting at the key frame at or before ``from_s``."""
     import av  # of the extra that also brings pyarrow: see missing_extra
 
     with _reading(path), av.open(str(path)) as container:
@@ -417,7 +416,7 @@ def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, Non
 def _stored_pictures(
     folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], *, gray: bool
 ) -> Iterator[tuple[int, Picture]]:
-    """Pictures that the tables hold themselves, no more than a group of rows in memory."""
+    """Images that are stored in the tables, with at most one row group in memory."""
     places: dict[tuple[int, int], tuple[Path, int]] = {}
     for path, table in _tables(folder, "data", ["episode_index", "frame_index"]).items():
         with _reading(path):
@@ -449,7 +448,9 @@ def _stored_pictures(
 
 
 def _cells(folder: Path, path: Path, key: str, position: int) -> tuple[Iterator[Any], int]:
-    """Cells of a column from the group of rows on that has the row ``position``, and the first one's own position."""
+    """Cells of a column from the row group that contains the row ``position`` on, and the position of the first
+    cell.
+    """
     with _reading(path):
         file = _table(folder, path, [key])
         first = begin = 0
@@ -459,7 +460,7 @@ def _cells(folder: Path, path: Path, key: str, position: int) -> tuple[Iterator[
 
     def cells() -> Iterator[Any]:
         with _reading(path):
-            for group in range(first, file.num_row_groups):  # several at once are kept to the last
+            for group in range(first, file.num_row_groups):  # if read together, all would stay in memory to the end
                 for batch in file.iter_batches(CELLS, row_groups=[group], columns=[key]):
                     yield from batch.column(0).to_pylist()
 

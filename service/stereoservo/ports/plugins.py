@@ -1,5 +1,5 @@
 """Plug-ins by entry point (drivers, detectors, laws, commands): imported on demand; a broken one is listed as such,
-with the extra of the installation that it lacks.
+with the missing extra of the installation.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BESIDE = {
     "cell": ", or with the simulated cell: pip install 'stereoservo[demo]'",
     "sim": " on Python 3.11, Linux x86_64; elsewhere pybullet has no wheel, and `pip install pybullet` compiles it",
 }
-"""What is to be said of an extra."""
+"""Remarks on extras."""
 
 
 class PluginError(Exception):
@@ -56,7 +56,7 @@ class PluginError(Exception):
 
 
 def missing_extra(error: BaseException) -> str | None:
-    """What to install where ``error`` is the import of a module that an extra brings; None for any other error."""
+    """Message naming the extra to install if ``error`` is a failed import of one of its modules; else None."""
     if not isinstance(error, ModuleNotFoundError) or error.name is None:
         return None
     module = error.name.partition(".")[0]
@@ -69,7 +69,7 @@ def missing_extra(error: BaseException) -> str | None:
 
 @dataclass(frozen=True)
 class Plugin:
-    """One entry point; ``error`` is empty where it imports (or was not tried)."""
+    """One entry point; ``error`` is empty if it imports (or was not tried)."""
 
     group: str
     name: str
@@ -91,7 +91,7 @@ def list_plugins(group: str, *, check: bool = False) -> list[Plugin]:
         if check:
             try:
                 entry.load()
-            except Exception as caught:  # whatever a third party's module raises on import
+            except Exception as caught:  # a third party's module may raise anything on import
                 error = _cause(caught)
         found.append(Plugin(group, entry.name, entry.value, _distribution(entry), error))
     return found
@@ -119,7 +119,7 @@ def load(group: str, name: str) -> Any:
 
 
 def _cause(error: Exception) -> str:
-    """Why a plug-in does not import."""
+    """Why the import of a plug-in fails."""
     return missing_extra(error) or f"{type(error).__name__}: {error}"
 
 

@@ -1,1 +1,1 @@
-"""Channels for what must not be lost between processes whose ends may die, hang or start anew."""
+"""Lossless channels between processes that may die, hang or be restarted."""

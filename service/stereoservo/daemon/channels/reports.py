@@ -1,4 +1,4 @@
-"""Reports of vision processes and supervisor, which the gateway passes on to clients: both ends of their channel."""
+"""Reports of vision processes and supervisor, which the gateway forwards to clients: both ends of their channel."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Reporter:
         self._channel: PacketChannel | None = None
 
     def report(self, kind: str, message: str, images: RecordedImages | None = None) -> None:
-        """Queue a report, log it, and send what waits."""
+        """Queue a report, log it, and send the queue."""
         write_log(self._origin, message)
         self._lost += self._outbox.full
         self._add(kind, message, images)
@@ -46,7 +46,7 @@ class Reporter:
         self._outbox.add(self._number, encode(report))
 
     def flush(self) -> None:
-        """Send what waits, as far as the gateway takes it; hear what it has got, and whether it is gone."""
+        """Send the queue, as far as the gateway accepts it; read its acknowledgements, and whether it has closed."""
         if not self._outbox:
             return
         if self._channel is not None:
@@ -60,28 +60,28 @@ class Reporter:
         if self._channel is None or not self._channel.is_open:
             try:
                 self._channel = PacketChannel.connect(self._path)
-            except ChannelError:  # the gateway is not up (yet): tried again at the next flush
+            except ChannelError:  # the gateway does not run (yet): tried again at the next flush
                 return
             self._outbox.resume(0)
         self._outbox.flush(self._channel)
 
 
 class ReportIntake:
-    """The gateway's end: takes each report once. Raises OSError."""
+    """The gateway's end: receives each report once. Raises OSError."""
 
     def __init__(self, path: Path) -> None:
         self._server = ChannelServer(path)
         self._boundary = RecordBoundary("reports of vision processes and supervisor", partial(write_log, "gateway"))
         self._had: dict[str, tuple[int, int]] = {}
-        """Of each origin its stream (a process that is started anew begins another) and the last number of it."""
+        """For each origin its stream (a restarted process begins a new one) and the last number of the stream."""
 
     @property
     def note(self) -> str:
-        """Text on reports that could not be read; empty where there were none."""
+        """Text on reports that could not be read; empty if there were none."""
         return self._boundary.note
 
     def poll(self, take: Callable[[Report], None]) -> None:
-        """Hand the reports that have arrived to ``take``, and tell their senders, which then keep them no longer."""
+        """Pass the received reports to ``take``, and acknowledge them to their senders, which then delete them."""
         self._server.accept()
         for peer in self._server.peers:
             for data in peer.receive():

@@ -1,8 +1,8 @@
 """Unix SEQPACKET sockets between processes: non-blocking, whole messages of bounded size, a server for many peers.
 
-A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a
-restarted gateway replaces the one that died). Nothing here blocks; a full socket is reported to the
-caller, who decides what to drop.
+A :class:`ChannelServer` accepts any number of peers or, with ``single=True``, keeps only the newest (a restarted
+gateway replaces the one that died). No call blocks; a full socket is reported to the caller, which decides what to
+drop.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ class PacketChannel:
 
     @classmethod
     def connect(cls, path: Path) -> Self:
-        """Connect to a server. Raises ChannelError where nobody listens."""
+        """Connect to a server. Raises ChannelError if nobody listens."""
         check_socket_path(path)
         connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         connection.setblocking(False)
         try:
             connection.connect(str(path))
-        except BlockingIOError as error:  # its queue is full: it would be waited for as long as it hangs
+        except BlockingIOError as error:  # its queue is full: a blocking call would wait as long as the server hangs
             connection.close()
             raise ChannelError("unreachable", f"{path}: its process accepts no connection (it hangs?)") from error
         except OSError as error:
@@ -65,7 +65,7 @@ class PacketChannel:
         return self._open
 
     def send(self, message: bytes) -> bool:
-        """Send a whole message or nothing; False where the peer does not drain its socket or has gone.
+        """Send a whole message or nothing; False if the peer does not read its socket or has closed it.
 
         Raises ChannelError for messages over ``MAX_MESSAGE_BYTES``.
         """
@@ -78,11 +78,11 @@ class PacketChannel:
         try:
             self._socket.send(message, socket.MSG_NOSIGNAL)
         except OSError:
-            return False  # a peer that has gone may have left messages: `receive` finds its end
+            return False  # a closed peer may have left messages: `receive` detects the end
         return True
 
     def receive(self, limit: int = 64) -> list[bytes]:
-        """Up to ``limit`` waiting messages, oldest first; marks the channel closed when the peer has gone."""
+        """Up to ``limit`` waiting messages, oldest first; marks the channel as closed if the peer has closed it."""
         messages: list[bytes] = []
         while self._open and len(messages) < limit and self._waiting.poll(0):
             try:
@@ -90,7 +90,7 @@ class PacketChannel:
             except BlockingIOError:
                 break
             except ConnectionResetError:
-                continue  # raised once, where the peer left messages unread; those it sent are still there
+                continue  # raised once, if the peer left messages unread; the messages that it sent can still be read
             except OSError:
                 self.close()
                 break
@@ -136,7 +136,7 @@ class ChannelServer:
         return self._socket.fileno()
 
     def accept(self) -> list[PacketChannel]:
-        """Accept waiting peers, drop those that have gone; returns the new ones."""
+        """Accept waiting peers, drop closed ones; returns the new ones."""
         self.peers = [peer for peer in self.peers if peer.is_open]
         fresh: list[PacketChannel] = []
         while self._waiting.poll(0):
@@ -167,18 +167,18 @@ class ChannelServer:
 
 
 def _readable(one: socket.socket) -> select.poll:
-    """Tells for half a microsecond whether a call would find something; one that fails costs up to fifty."""
+    """Poll object that reports in half a microsecond whether a call would succeed; a failing call takes up to fifty."""
     waiting = select.poll()
     waiting.register(one, select.POLLIN)
     return waiting
 
 
 # -- the sender's side ---------------------------------------------------------------------------------------
-# The sender's side of a channel between processes whose other end may die, hang or start anew: messages are numbered
-# and kept, the receiver says up to which number it has them (`ipc_messages.Received`), and what comes after is sent.
+# The sender's side of a channel to a process that may die, hang or be restarted: messages are numbered and
+# kept, the receiver acknowledges them up to a number (`ipc_messages.Received`), and later ones are sent.
 #
-# That a socket took a message says nothing: what its reader leaves unread is gone with it. So a new connection goes on
-# after what the receiver has, not after what was sent over the old one.
+# Acceptance by the socket is not enough: messages that its reader leaves unread are lost. So a new connection continues
+# after the acknowledged messages, not after those sent over the old connection.
 
 
 class Outbox:
@@ -193,24 +193,24 @@ class Outbox:
 
     @property
     def full(self) -> bool:
-        """Whether the next message takes the place of the oldest."""
+        """Whether the next message replaces the oldest."""
         return len(self._kept) == self._kept.maxlen
 
     def add(self, number: int, data: bytes) -> None:
-        """Keep a message; the oldest is dropped where there is no room."""
+        """Store a message; the oldest is dropped if the outbox is full."""
         self._kept.append((number, data))
 
     def resume(self, number: int) -> None:
-        """Over a new connection: the receiver has the messages up to ``number``, those after it are sent (again)."""
+        """Continue over a new connection: the receiver has the messages up to ``number``, later ones are sent."""
         self._sent = number
 
     def release(self, number: int) -> None:
-        """Keep no longer what the receiver has: the messages up to ``number``."""
+        """Delete the acknowledged messages, up to ``number``."""
         while self._kept and self._kept[0][0] <= number:
             self._kept.popleft()
 
     def flush(self, channel: PacketChannel) -> None:
-        """Send what was not sent yet, as far as the channel takes it."""
+        """Send the unsent messages, as far as the channel accepts them."""
         if not self._kept or self._kept[-1][0] <= self._sent:
             return
         for number, data in self._kept:

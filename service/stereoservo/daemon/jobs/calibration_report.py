@@ -1,7 +1,7 @@
 """Report of a calibration as one self-contained HTML page: marker tracks, residuals by joint and camera, fit
 statistics, and assessment.
 
-A folder beside the model file, written whole or not at all, by the fit process once the model is safe.
+A folder next to the model file, written atomically by the fit process after the model is saved.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from stereoservo.messages.known_length import known_length_of
 DPI = 90
 HISTOGRAM = np.linspace(-5.0, 5.0, 41)
 LISTED = 60
-"""Pixels left out that are listed one by one."""
+"""Largest number of omitted pixels that are listed individually."""
 
 _STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1100px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -61,8 +61,8 @@ td:first-child, th:first-child { text-align: left } img { max-width: 100% }
 
 @dataclass(frozen=True)
 class Residuals:
-    """Residuals of the trials: ``pixels`` (k, 2) measured less predicted [px], in ``sigmas`` (k, 2); the camera and
-    the trial's joint (-1: the base) of each, and whether the fit left it out.
+    """Residuals of the trials: ``pixels`` (k, 2) measured minus predicted [px], in ``sigmas`` (k, 2); the camera and
+    the trial's joint (-1: the base) of each, and whether the fit excluded it.
     """
 
     data: Measurements
@@ -73,8 +73,8 @@ class Residuals:
 
 
 def residuals_of(model: CellModel, trials: TrialData, report: CalibrationReport) -> Residuals:
-    """Residuals of every pixel of the model's markers, beside the errors that its joints' readings have. Raises
-    CalibrationError where the trials are not the model's.
+    """Residuals of every pixel of the model's markers, with the errors of the joint readings removed. Raises
+    CalibrationError if the trials do not belong to the model.
     """
     rig, order = acting_rig(model), acting_order(model)
     data = known_measurements(model, trials, order)
@@ -227,7 +227,7 @@ def _facts(model: CellModel, report: CalibrationReport) -> str:
 
 
 def floors(model: CellModel, rest: Residuals) -> FloatArray:
-    """Expected residual rms (n,) [px] of each joint's trial: the fit's, or its sigmas where the model has none."""
+    """Expected residual rms (n,) [px] of each joint's trial: the fit's, or its sigmas if the model has none."""
     statistics = model.statistics
     found = []
     for j in range(len(model.joint_names)):
@@ -250,7 +250,7 @@ def _joints(model: CellModel, rest: Residuals) -> str:
 
 
 def _joint_errors(report: CalibrationReport) -> list[str]:
-    """Section of what the joints' readings are off by; empty where the trials show nothing of it."""
+    """Section on the errors of the joint readings; empty if the trials show none."""
     if not report.joints:
         return []
     rows: list[tuple[object, ...]] = []
@@ -273,8 +273,8 @@ def _joint_errors(report: CalibrationReport) -> list[str]:
 
 
 def _quantities(model: CellModel) -> str:
-    """Section of gauge-invariant quantities with deviations; those of the images are folded, undetermined ones are
-    named.
+    """Section on gauge-invariant quantities with standard deviations; those of the images are folded, undetermined ones
+    are listed.
     """
     inner: list[tuple[object, ...]] = []
     seen: list[tuple[object, ...]] = []
@@ -300,7 +300,7 @@ def _quantities(model: CellModel) -> str:
 
 
 def _dimensions(model: CellModel, text: str) -> list[str]:
-    """Section of the arm's Denavit-Hartenberg parameters by the known length that ``text`` states; empty without."""
+    """Section of the arm's Denavit-Hartenberg parameters by the known length stated in ``text``; empty without it."""
     if not text:
         return []
     heading = f"<h2>Denavit-Hartenberg parameters, by {_e(text)}</h2>"
@@ -317,7 +317,7 @@ def _dimensions(model: CellModel, text: str) -> list[str]:
 
 
 def _to_deviation(value: float, std: float | None) -> str:
-    """``value`` rounded to the digits that are significant for its deviation."""
+    """``value`` rounded to the significant digits for its standard deviation."""
     if not std:
         return f"{value:.6g}"
     return f"{value:.{decimals(std)}f}"
@@ -411,7 +411,7 @@ def draw_tracks(trials: TrialData) -> Figure:
 
 
 def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) -> Figure:
-    """Figure of the residual rms of each joint beside the expected one, and of each camera."""
+    """Figure of the residual rms of each joint, with the expected one, and of each camera."""
     figure = Figure(figsize=(11.0, 3.4), layout="constrained")
     left, right = _axes(figure, 1, 2)
     kept = ~rest.left_out
@@ -423,7 +423,7 @@ def draw_levels(model: CellModel, report: CalibrationReport, rest: Residuals) ->
     left.bar(mine - 0.2, levels, 0.4, label="residual rms")
     left.bar(mine + 0.2, floors(model, rest), 0.4, label="floor", color="0.7")
     left.set(xticks=mine, xticklabels=model.joint_names, ylabel="[px]", title="by joint")
-    left.margins(y=0.25)  # room for the legend above the bars
+    left.margins(y=0.25)  # space for the legend above the bars
     left.legend(fontsize="small", loc="upper right", ncols=2)
     cameras = [kept & (rest.data.camera == c) for c in range(len(model.cameras))]
     right.bar([camera.name for camera in model.cameras], [float(np.sqrt(squares[m].mean())) for m in cameras], 0.5)
@@ -458,7 +458,7 @@ def draw_histograms(model: CellModel, rest: Residuals) -> Figure:
 
 
 def draw_vectors(model: CellModel, rest: Residuals) -> Figure:
-    """Figure of the residual vectors over each image, magnified such that the rms is a thirtieth of the width."""
+    """Figure of the residual vectors over each image, magnified so that the rms is a thirtieth of the width."""
     c = len(model.cameras)
     figure = Figure(figsize=(5.8 * c, 4.8), layout="constrained")
     kept = ~rest.left_out

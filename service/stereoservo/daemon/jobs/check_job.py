@@ -37,7 +37,7 @@ def check_and_remember(
     """Examine a model, find trends over earlier checks, append the report to the history. ``body_moves``: as of
     `make_check_report`.
 
-    A damaged history is set aside, one that cannot be written is left as it is: the report says so. Raises
+    A damaged history is renamed, one that cannot be written is not changed; the report states this. Raises
     ModelFileError, CalibrationError.
     """
     model = load_model(model_path)
@@ -58,7 +58,7 @@ def check_and_remember(
     report = msgspec.structs.replace(report, trend="; ".join(notes))
     try:
         save_checks(history_path, [*history, report])
-    except OSError as error:  # the result of the check counts all the same
+    except OSError as error:  # the result of the check is valid nevertheless
         report = msgspec.structs.replace(
             report, trend="; ".join([*notes, f"the check is not stored: {error.strerror}"])
         )
@@ -66,7 +66,7 @@ def check_and_remember(
 
 
 def reset_and_save(examined: ModelExamination, report: CheckReport, path: Path, epoch: int) -> ZeroReset:
-    """Save the model with drifted joint zeros moved. Raises CalibrationError, ModelFileError, OSError."""
+    """Save the model with corrected joint zeros. Raises CalibrationError, ModelFileError, OSError."""
     model, reset = reset_zeros(examined, report, epoch=epoch, created=report.created)
     save_model(model, path)
     return msgspec.structs.replace(reset, model=str(path))
@@ -102,7 +102,7 @@ MAX_HISTORY_BYTES = 1 << 26
 
 
 def load_checks(path: Path) -> tuple[list[CheckReport], int]:
-    """Reports of the checks stored in ``path`` (none where there is no file), and the number of unreadable lines."""
+    """Reports of the checks stored in ``path`` (empty if there is no file), and the number of unreadable lines."""
     boundary = RecordBoundary(str(path))
     found: list[CheckReport] = []
     lines: list[bytes] = []
@@ -115,7 +115,7 @@ def load_checks(path: Path) -> tuple[list[CheckReport], int]:
 
 
 def _decode_check(line: bytes) -> CheckReport:
-    """A stored check whose numbers `find_trend` can work with. Raises anything."""
+    """A stored check with numbers that are valid for `find_trend`. May raise any exception."""
     check = msgspec.json.decode(line, type=CheckReport)
     if check.created:
         datetime.fromisoformat(check.created)

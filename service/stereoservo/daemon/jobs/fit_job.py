@@ -34,7 +34,7 @@ NICENESS = 10
 
 
 def print_line(line: dict[str, Any]) -> None:
-    """One JSON object on stdout."""
+    """Print one JSON object to stdout."""
     sys.stdout.write(msgspec.json.encode(line, enc_hook=_plain).decode() + "\n")
     sys.stdout.flush()
 
@@ -47,9 +47,7 @@ def error_line(error: Exception) -> dict[str, Any]:
 
 
 def child_arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """The arguments of this process, whose priority is low from here on, and which dies with its ``--parent``, where
-    there is one.
-    """
+    """Parse the arguments of this process, lower its priority, and make it die with its ``--parent``, if given."""
     parser.add_argument("--parent", type=int, default=0, help="end with this process")
     arguments = parser.parse_args()
     if arguments.parent:
@@ -85,7 +83,7 @@ def fit_trials(
     result = fit_model(trials, epoch=epoch, created=created, progress=progress, lens_priors=lens_priors)
     figures = msgspec.json.format(msgspec.json.encode(result.report), indent=1) + b"\n"
     write_atomically(figures_file(model_path), figures)
-    # Last: a model that is there is used from the next start on, also of a fit that failed for a full disk.
+    # Last: an existing model file is used from the next start on, even if the fit then fails because of a full disk.
     save_model(with_groups(result.model), model_path)
     return result, assess_fit(result.model, result.report, depth_spread(result.model, trials))
 

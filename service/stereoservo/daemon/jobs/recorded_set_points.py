@@ -17,15 +17,17 @@ from stereoservo.ports.devices import CameraObservation
 from stereoservo.ports.image_files import image_lines
 
 GATE_SIGMAS = 6.0
-"""One in 500 million a coordinate: with a thousand of them a false refusal is rarer than one in 100 000."""
+"""Gate [sigmas]: one in 500 million per coordinate; with a thousand coordinates fewer than one in 100 000 goals is
+rejected by chance.
+"""
 MOVED_PX = 0.1
-"""What a marker may drift from the first frame to the last, however well it is seen."""
+"""Largest drift of a marker from the first frame to the last [px] that is always accepted."""
 APART_PX = 0.2
-"""What one frame may be off the mean, likewise."""
+"""Largest deviation of one frame from the mean [px] that is always accepted."""
 
 
 class SetPointError(Exception):
-    """Recorded images give no set-points; the text names camera, marker or frame, and a remedy.
+    """Recorded images do not determine set-points; the message names camera, marker or frame, and a remedy.
 
     ``code``: ``no_recording``, ``too_few_frames``, ``no_markers``, ``moving``, ``disagree``.
     """
@@ -100,7 +102,7 @@ def _camera_set_points(
 
 
 def averaged(camera: str, seen: list[CameraObservation], at_s: float, size: tuple[int, int]) -> SetPoints:
-    """Mean of frames at rest. Raises SetPointError: no markers, a marker that moves, an inconsistent frame."""
+    """Mean of frames at rest. Raises SetPointError: no markers, a moving marker, an inconsistent frame."""
     times = np.array([observation.t_shutter_ns - seen[0].t_shutter_ns for observation in seen]) * 1e-9
     ids = sorted({int(marker) for observation in seen for marker in observation.ids})
     pixels: dict[int, tuple[float, float]] = {}
@@ -128,8 +130,8 @@ def averaged(camera: str, seen: list[CameraObservation], at_s: float, size: tupl
 
 
 def _require_rest(camera: str, marker: int, t: FloatArray, pixels: FloatArray, variances: FloatArray) -> None:
-    """Raise SetPointError where a marker (n, 2) drifts over times (n,) [s], or one frame deviates from the others,
-    by more than the variances (n,) [px²] explain.
+    """Raise SetPointError if a marker (n, 2) drifts over times (n,) [s], or if one frame deviates from the others, by
+    more than the variances (n,) [px²] explain.
     """
     off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
     beyond = off > np.maximum(GATE_SIGMAS * np.sqrt(variances), APART_PX)

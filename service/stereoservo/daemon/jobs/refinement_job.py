@@ -29,20 +29,20 @@ from stereoservo.ports.devices import CameraObservation
 
 MOST_POSES = 128
 APART = 0.02
-"""Distance of two poses [rad or m, over all joints] below which they are one."""
+"""Distance of two poses [rad or m, over all joints] below which they count as equal."""
 STILL = 2e-4
 """Motion of a joint [rad or m] that ends a rest."""
 MOST_READINGS = 200
-"""Of a rest, whose mean is its pose."""
+"""Largest number of joint readings of a rest; their mean is its pose."""
 FRAMES, SETTLE_S = 5, 0.15
-"""Where the cell has no [calibration]: frames of each camera that are averaged, and time to settle before them."""
+"""Values without a [calibration] section of the cell: averaged frames per camera, and settling time before them [s]."""
 
 
 class RestPoses:
-    """Rest poses that goals left behind: mean joint readings, and each camera's mean pixels over some frames.
+    """Rest poses at the ends of goals: mean joint readings, and each camera's mean pixels over some frames.
 
-    A pose counts once; of more than `MOST_POSES` those are kept that lie farthest apart in joint space. A frame counts
-    where its shutter lies between two states of the arm at rest, settled.
+    Equal poses are stored once; of more than `MOST_POSES`, those farthest apart in joint space are kept. A frame is
+    used if its shutter time lies between two states of the arm at rest, after settling.
     """
 
     def __init__(self, settings: CoreSettings) -> None:
@@ -58,19 +58,19 @@ class RestPoses:
         self.poses: list[Event] = []
 
     def clear(self) -> None:
-        """Forget all poses, also the one that is being looked at."""
+        """Delete all poses, including the current one."""
         self.poses.clear()
         self._places.clear()
         self.leave()
 
     def leave(self) -> None:
-        """The arm moves, or is not to be trusted: what this rest has shown so far does not count."""
+        """Discard the data of the current rest: the arm moves, or its state is not trusted."""
         self._readings.clear()
         self._waiting.clear()
         self._done = False
 
     def add_frame(self, observation: CameraObservation) -> None:
-        """A frame of a camera; kept until a later state tells whether the arm was at rest."""
+        """Add a frame of a camera; it is kept until a later state shows whether the arm was at rest."""
         late = self._readings and not self._done and observation.t_shutter_ns >= self._settled_ns
         mine = sum(one.camera == observation.camera for one in self._waiting)
         newer = all(one.seq != observation.seq for one in self._waiting if one.camera == observation.camera)
@@ -78,7 +78,7 @@ class RestPoses:
             self._waiting.append(observation)
 
     def add_state(self, status: Status) -> bool:
-        """A trusted state of the arm; returns whether a pose was added."""
+        """Add a trusted state of the arm; returns whether a pose was added."""
         positions = status.positions
         if status.command.any() or (self._readings and float(np.abs(positions - self._readings[0]).max()) > STILL):
             self.leave()
@@ -106,7 +106,7 @@ class RestPoses:
     def _keep(self, pose: Event, joints: FloatArray) -> bool:
         away = [float(np.linalg.norm(place - joints)) for place in self._places]
         if away and min(away) < APART:
-            self.poses[int(np.argmin(away))] = pose  # the newer one tells how the cell is now
+            self.poses[int(np.argmin(away))] = pose  # the newer one describes the current cell
             return False
         self.poses.append(pose)
         self._places.append(joints)
@@ -114,7 +114,7 @@ class RestPoses:
             places = np.array(self._places)
             apart = np.linalg.norm(places[:, None] - places[None], axis=2)
             apart[np.diag_indices(len(places))] = np.inf
-            # Of the two that are nearest to each other the one with the nearer second neighbour goes.
+            # Of the two nearest poses, the one with the nearer second neighbour is removed.
             pair = np.unravel_index(int(apart.argmin()), apart.shape)
             second = [float(np.partition(apart[k], 1)[1]) for k in pair]
             gone = int(pair[int(np.argmin(second))])

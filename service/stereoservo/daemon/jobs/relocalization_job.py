@@ -32,7 +32,7 @@ MAX_EVENTS_BYTES = 1 << 26
 
 
 class RelocalizationReport(msgspec.Struct, frozen=True):
-    """Result of a relocalization. ``cameras``: names and, in words, how each moved; ``predicted_px``: largest
+    """Result of a relocalization. ``cameras``: names and descriptions of the motions; ``predicted_px``: largest
     standard deviation of a predicted pixel over the range of the joints.
     """
 
@@ -81,7 +81,7 @@ def main() -> int:
 
 
 MOST_POSES = 12
-"""Number of newest poses that are used."""
+"""Number of poses that are used: the newest ones."""
 
 
 class RelocalizationPoses:

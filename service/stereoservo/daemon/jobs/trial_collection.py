@@ -13,9 +13,11 @@ from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.kinematics.model import JointLoads
 
 LEAST_NOISE = 1e-9
-"""Part of a variance below which noise is the rounding of a difference."""
+"""Fraction of a variance below which noise is only the rounding error of a difference."""
 MOST_NOISE = 3.0
-"""Stated variance of a single sight, in medians over all stops, beyond which more than noise is stated."""
+"""Stated variance of one observation, relative to the median over all stops, above which it includes more than
+noise.
+"""
 
 
 class TrialCollector:
@@ -31,7 +33,7 @@ class TrialCollector:
 
     @property
     def stops(self) -> int:
-        """Stops gathered so far."""
+        """Number of stops collected so far."""
         return len(self._stops)
 
     def add(self, event: Event) -> None:
@@ -49,8 +51,8 @@ class TrialCollector:
     def trials(self) -> TrialData:
         """All stops as trial data, without markers that no camera ever saw or that are static (``standing``).
 
-        Ids that the cell states to be static go into ``TrialData.static``, but for those that moved (``strayed``).
-        Raises CalibrationError (``too_few_stops``) where there is no stop.
+        Ids that are static by the cell file are stored in ``TrialData.static``, except those that moved (``strayed``).
+        Raises CalibrationError (``too_few_stops``) if there is no stop.
         """
         if not self._stops:
             raise CalibrationError(
@@ -105,7 +107,7 @@ class TrialCollector:
         )
 
     def _way(self) -> WayObservations | None:
-        """What was seen between the stops; None where nothing was kept."""
+        """Observations between the stops; None if there are none."""
         records = [(k, event.way) for k, event in enumerate(self._stops) if event.way is not None]
         frames = [(k, frame) for k, record in records for frame in record.frames]
         if not frames:
@@ -116,7 +118,7 @@ class TrialCollector:
         for row, (_, frame) in enumerate(frames):
             markers[row, : len(frame.ids)] = frame.ids
             pixels[row, : len(frame.ids)] = frame.pixels
-        start_ns = int(records[0][1].joints_ns[0])  # of this boot's clock: seconds from there keep their digits
+        start_ns = int(records[0][1].joints_ns[0])  # clock of this boot: relative seconds keep their precision
         return WayObservations(
             ways=np.array([k for k, _ in frames], dtype=np.int64),
             cameras=np.array([frame.camera for _, frame in frames], dtype=np.int64),
@@ -129,12 +131,12 @@ class TrialCollector:
         )
 
     def _noise_factor(self, camera: CameraSettings) -> float:
-        """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum
-        likelihood over all stops, the mean of the ratios by degrees of freedom.
+        """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum likelihood
+        over all stops, the mean of the ratios by degrees of freedom.
 
-        Not a ratio of sums, which few markers of great variance would rule: one of 0.16 px among thousands of 0.005 px
-        changes it by a sixth. Markers beyond MOST_NOISE do not count at all: what is stated of them is doubt (dots
-        that touch, a dot that does not fit its face), which does not scatter. 1 where single frames were taken or the
+        A ratio of sums would be dominated by few markers of large variance: one of 0.16 px among thousands of 0.005 px
+        changes it by a sixth. Markers beyond MOST_NOISE are not used: their stated variance expresses doubt (touching
+        dots, a dot that does not fit its face), which does not appear as scatter. 1 if single frames were taken or the
         detector states no noise.
         """
         samples = [sample for event in self._stops for sample in event.samples if sample.camera == camera.name]

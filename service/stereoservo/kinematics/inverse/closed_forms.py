@@ -1,4 +1,4 @@
-"""Closed-form solutions of inverse kinematics subproblems: angles or positions of a few joints that bring points to
+"""Closed-form solutions of inverse kinematics subproblems: angles or positions of a few joints that move points to
 targets (thesis 6), not yet checked against the whole chain.
 """
 
@@ -14,16 +14,18 @@ from stereoservo.geometry.displacements import exp_rotation, exp_translation
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 FREE = 1e-9
-"""Radius of a joint's circle, as a share of what its operator could move, below which the joint moves nothing."""
+"""Radius of a joint's circle, relative to its operator's largest motion, below which the joint does not move the
+point.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Branches:
     """k candidate solutions of n joints, as displacements from the zero.
 
-    ``steps`` (k, n) [rad or m]. ``excess`` (k, n): by how much a joint's equation fails to have a root, as a share of
-    its amplitude; 0 where it has one, infinite where the joint moves nothing that matters. The step is then that of
-    the nearest approach. ``free`` (k, n): the equation holds for every position of this joint, which stays at its seed.
+    ``steps`` (k, n) [rad or m]. ``excess`` (k, n): distance of a joint's equation from having a root, relative to its
+    amplitude; 0 if it has one, infinite if the joint has no effect. The step is then that of the closest approach.
+    ``free`` (k, n): the equation holds for every position of this joint, which stays at its seed.
     """
 
     steps: FloatArray
@@ -37,7 +39,9 @@ def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
 
 
 def beside(first: Branches, second: Branches) -> Branches:
-    """Joints of ``second`` appended to those of ``first``; a single candidate is repeated for all of the other."""
+    """Branches with the joints of ``second`` appended to those of ``first``; a single candidate is combined with all
+    others.
+    """
     k = max(len(first.steps), len(second.steps))
 
     def wide(left: npt.NDArray, right: npt.NDArray) -> npt.NDArray:  # type: ignore[type-arg]
@@ -63,15 +67,15 @@ def one_of(branches: Branches, i: int) -> Branches:
 
 
 INDEPENDENT = 1e-9
-"""Least over largest singular value of the joints' directions that are not linearly dependent."""
+"""Smallest over largest singular value of the joints' directions from which on they are linearly independent."""
 
 
 def prismatic_joints(operators: FloatArray, A: FloatArray, target: FloatArray) -> Branches:
     """Positions [m] of n joints of operators (n, 4, 4) that take points ``A`` (m, 4) to ``target`` (m, 4) (6.6).
 
-    Planes through each target, its orthogonal complement (3, 4), hold the moved point: no heights are needed. Where
-    the target is off what the joints reach, the least squares over these planes; where directions depend on one
-    another, the least motion, with these joints marked free.
+    The moved point must lie in the planes through its target, the orthogonal complement (3, 4) of the target: no
+    heights are needed. If the target is out of reach, the solution is the least squares over these planes; if
+    directions are linearly dependent, it is the smallest motion, with these joints marked free.
     """
     rows, sides = [], []
     for point, goal in zip(A, target, strict=True):
@@ -90,8 +94,8 @@ def prismatic_joints(operators: FloatArray, A: FloatArray, target: FloatArray) -
 
 @dataclass(frozen=True, eq=False)
 class Crossing:
-    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one at the closest approach where they
-    do not meet, or the seed where the whole circle lies in the plane. ``excess`` and ``free`` as in `Branches`.
+    """Angles (k,) [rad] at which a point on its circle lies in a plane: two; one at the closest approach if they do not
+    intersect, or the seed if the whole circle lies in the plane. ``excess`` and ``free`` as in `Branches`.
     """
 
     angles: FloatArray
@@ -125,9 +129,9 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
     """Rotation angle [rad] about a revolute operator ``G`` (4, 4) that moves points ``A`` (..., 4) closest to
     ``target``.
 
-    Points and targets of equal heights. The radial part of the target, ``-Ĥ²A*``, is resolved along those of the point
-    and of its motion, ``-Ĥ²A`` and ``ĤA``: the plane of (6.11) through axis and target in one linear step, with
-    neither the trivial second root nor a choice of plane. ``excess``: how far the radii differ. Free where all of
+    Points and targets of equal heights. The radial part of the target, ``-Ĥ²A*``, is resolved along the radial parts of
+    the point and of its motion, ``-Ĥ²A`` and ``ĤA``: one linear step for the plane of (6.11) through axis and target,
+    without the trivial second root and without a choice of plane. ``excess``: difference of the radii. Free if all of
     ``A`` lies on the axis.
     """
     points, goals = np.reshape(A, (-1, 4)), np.reshape(target, (-1, 4))
@@ -142,10 +146,9 @@ def turn_between(G: FloatArray, A: FloatArray, target: FloatArray, seed: float =
 
 
 def normal_plane(G: FloatArray, A: FloatArray) -> FloatArray:
-    """Plane (4,) normal to the axis of ``G`` (4, 4) through ``A`` (4,): of the pencil ``aᵀĤ = 0``, which is
-    invariant.
+    """Plane (4,) normal to the axis of ``G`` (4, 4) through ``A`` (4,): it belongs to the invariant pencil ``aᵀĤ = 0``.
 
-    Also where A lies on the axis, and spans no circle with ``ĤA`` and ``Ĥ²A``.
+    Also valid if A lies on the axis, where ``A``, ``ĤA`` and ``Ĥ²A`` span no circle.
     """
     pencil = np.linalg.svd(G)[0][:, 2:]
     heights = A @ pencil
@@ -166,8 +169,8 @@ def common_point(operators: FloatArray) -> FloatArray:
 def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
     """Angles of two joints ``G`` (2, 4, 4) that are not parallel, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.12).
 
-    The target, rotated back about joint 1, crosses the plane of the circle of ``A`` about joint 2 twice (6.16);
-    each crossing leaves one turn about joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
+    The target, rotated back about joint 1, crosses the plane of the circle of ``A`` about joint 2 twice (6.16); each
+    crossing determines one angle of joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
     """
     if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
         return beside(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
@@ -183,10 +186,10 @@ def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArr
 def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
     """Angles of two joints ``G`` (2, 4, 4) with parallel axes, ``exp(θ₁Ĥ₁) exp(θ₂Ĥ₂) A = A*`` (6.17-6.22).
 
-    The law of cosines needs lengths in the plane of motion up to one scale. Joint 1 has them: its operator is a quarter
-    turn of that plane's directions, which are its range, so that they are complex numbers. ``A``, ``target`` (4,) of
-    equal heights, ``seed`` (2,). Axes of opposite sense are parallel, too. Corrupted input is projected onto the
-    range of joint 1.
+    The law of cosines needs lengths in the plane of motion up to one scale. They follow from joint 1: its operator acts
+    as a quarter turn on the directions of that plane, its range, which can be treated as complex numbers. ``A``,
+    ``target`` (4,) of equal heights, ``seed`` (2,). Axes of opposite sense count as parallel, too. Noisy input is
+    projected onto the range of joint 1.
     """
     square = -G[0] @ G[0]
     range_basis = np.linalg.svd(square)[0]
@@ -231,8 +234,8 @@ def _signed(angle: float, opposite: bool) -> float:
 def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
     """Angles of three joints ``G`` (3, 4, 4) that take ``A`` (4,) to ``target`` (4,), up to four (6.24-6.26).
 
-    Joints 2 and 3 keep the point in the plane across their axes (6.23), which leaves two angles of joint 1; each leaves
-    a problem of two parallel joints. Equal heights; ``seed`` (3,).
+    Joints 2 and 3 keep the point in the plane normal to their axes (6.23), which determines two angles of joint 1; for
+    each, a problem of two parallel joints remains. Equal heights; ``seed`` (3,).
     """
     crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
@@ -246,9 +249,8 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
 def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """Angles of three joints ``G`` (3, 4, 4) whose product is the rotation ``H`` (4, 4), up to two (6.27, 6.28).
 
-    A point of the last axis, away from the centre, determines the first two joints; the rest of the rotation
-    determines the last. Where the first and the last axis fall together, the first joint stays at its ``seed`` (3,)
-    and is marked free.
+    A point of the last axis, away from the centre, determines the first two joints; the rest of the rotation determines
+    the last. If the first and the last axis coincide, the first joint stays at its ``seed`` (3,) and is marked free.
     """
     centre = common_point(G)
     ends = axis_points(G[2])
@@ -258,7 +260,7 @@ def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     found = []
     for i, (first, second) in enumerate(first_two.steps):
         rest = exp_rotation(G[1], -second) @ exp_rotation(G[0], -first) @ H
-        # The columns of the identity as points: turned, they are the columns of the rotation itself.
+        # The columns of the identity as points: rotated, they are the columns of the rotation.
         last = turn_between(G[2], np.eye(4), rest.T, seed[2])
         found.append(beside(one_of(first_two, i), last))
     return together(found)
@@ -267,16 +269,16 @@ def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
 def arm_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """Angles of six revolute joints ``G`` (6, 4, 4) whose product is ``H`` (4, 4), up to eight (6.29, 6.30).
 
-    The wrist's centre is moved by the arm alone: ``H W = H₁H₂H₃ W`` (errata to 6.29). What is left of ``H`` is the
-    wrist's rotation. ``seed`` (6,).
+    Only the arm moves the wrist's centre: ``H W = H₁H₂H₃ W`` (errata to 6.29). The remainder of ``H`` is the wrist's
+    rotation. ``seed`` (6,).
     """
     centre = common_point(G[3:])
     return _with_wrist(G, H, seed, arm(G[:3], centre, H @ centre, seed[:3]), exp_rotation)
 
 
 def gantry_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
-    """Positions of three prismatic joints under a spherical wrist, ``G`` (6, 4, 4), whose product is ``H`` (4, 4),
-    up to two.
+    """Joint values of three prismatic joints and a spherical wrist, ``G`` (6, 4, 4), whose product is ``H`` (4, 4), up
+    to two.
     """
     centre = common_point(G[3:])
     place = prismatic_joints(G[:3], centre[None], (H @ centre)[None])

@@ -1,5 +1,5 @@
 """Numerical inverse kinematics of chains without a closed form: descent from many start configurations to all isolated
-solutions, or to some of a continuum.
+solutions, or to some solutions of a continuum.
 """
 
 from __future__ import annotations
@@ -18,27 +18,27 @@ from stereoservo.numerics.compilation import kernel
 BATCH = 64
 FEWEST = 128
 MOST = 4096
-"""Starts of a search: in batches, at least, at most."""
+"""Number of starts of a search: per batch, at least, at most."""
 HITS = 8
-"""Starts that have to come to each solution before a search ends: what was found once may have unseen company."""
+"""Number of starts that must converge to each solution before a search ends, so that few solutions are missed."""
 TWINS = np.array([0.05, 0.2, 0.6])
-"""Steps [rad] from a solution along its weakest direction, where the other one of a close pair lies."""
+"""Steps [rad] from a solution along its weakest direction, where the other solution of a close pair lies."""
 POLISH = 1e-9
-"""Damping of the refinement of a candidate: next to none."""
+"""Damping of the refinement of a candidate: almost none."""
 REFINEMENTS = 8
 VALLEY = 1e-5
-"""Residual up to which the end of a descent that solves nothing is taken for one in a valley."""
+"""Residual up to which the end point of a descent without a solution counts as lying in a valley."""
 VALLEY_ROUNDS, VALLEY_STEPS, UNDAMPED = 4, 500, 1e-15
 CLOSE = 1e-5
-"""Largest difference of joints [rad or m] of two descents that came to one solution."""
+"""Largest difference of joints [rad or m] of two descents that converged to the same solution."""
 
 
 def even_starts(chain: ProjectiveChain, limits: FloatArray | None, count: int, skip: int = 0) -> FloatArray:
-    """Start configurations (count, n) spread evenly over the joints: a full turn, or limits (n, 2) for prismatic
+    """Start configurations (count, n) distributed evenly over the joints: a full turn, or limits (n, 2) for prismatic
     ones.
 
-    An additive recurrence, by powers of the root of ``x^(n+1) = x + 1``. Raises InverseKinematicsError, ``limits``,
-    where a prismatic joint has none.
+    Additive recurrence with powers of the root of ``x^(n+1) = x + 1``. Raises InverseKinematicsError, ``limits``, if a
+    prismatic joint has none.
     """
     n = chain.joints
     ranges = np.array([[z - np.pi, z + np.pi] for z in chain.zero])
@@ -70,8 +70,8 @@ def all_solutions(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Isolated solutions (s, n) of ``H(q)M = M*`` with residuals (s,), and the closest approach (n,).
 
-    The search ends when every solution has been come to from ``HITS`` starts; a pair that is close to merging is
-    looked for from its one half. That all are found is likely, not certain.
+    The search ends when ``HITS`` starts have converged to every solution; the other solution of a close pair is
+    searched for from the first one. It is likely, but not certain, that all are found.
     """
     known = _Known(chain, points, targets, tolerance)
     best, least = seed, np.inf
@@ -95,8 +95,8 @@ def all_solutions(
 def _along_valleys(
     chain: ProjectiveChain, points: FloatArray, targets: FloatArray, starts: FloatArray, tolerance: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Ends (s, n) and residuals (s,) of descents, those that ended in a valley followed to its lowest place: near a
-    singular configuration a curve of joints nearly keeps the goal, and steps along it are short.
+    """End points (s, n) and residuals (s,) of descents; those that ended in a valley are continued to its minimum. Near
+    a singular configuration the residual is almost zero along a curve of joint positions, and steps along it are short.
     """
     ends, left = descended(chain, points, targets, starts)
     slow = (left > tolerance) & (left <= VALLEY)
@@ -110,7 +110,7 @@ def _along_valleys(
 
 
 class _Known:
-    """Solutions found so far, and how many starts converged to each."""
+    """Solutions found so far, and the number of starts that converged to each."""
 
     def __init__(self, chain: ProjectiveChain, points: FloatArray, targets: FloatArray, tolerance: float) -> None:
         self.chain, self.points, self.targets, self.tolerance = chain, points, targets, tolerance
@@ -119,12 +119,14 @@ class _Known:
         self.hits: list[int] = []
 
     def add(self, ends: FloatArray, left: FloatArray, count: int) -> list[int]:
-        """Add those of ``ends`` (s, n) that solve the problem, each worth ``count`` hits; returns which are new."""
+        """Add those of ``ends`` (s, n) that solve the problem, each with ``count`` hits; returns the new ones'
+        indices.
+        """
         fresh = []
         solved = left <= self.tolerance
         ends, left = ends[solved], left[solved]
         while len(ends):
-            # All descents that came to where the best of those left did; a pair of solutions is farther apart.
+            # All descents that ended where the best of the remaining ones did; two solutions are farther apart.
             best = int(np.argmin(left))
             here = self._near(ends, ends[best])
             q, residual = ends[best], float(left[best])
@@ -145,8 +147,8 @@ class _Known:
         return fresh
 
     def _refined(self, q: FloatArray) -> tuple[FloatArray, float, bool]:
-        """The end ``q`` (n,) of a descent refined until it stays, its residual, and whether it does: where a solution
-        is nearly a double one, damped steps gain so little that a descent ends on its way there.
+        """The end point ``q`` (n,) of a descent refined to convergence, its residual, and whether it converged. Near an
+        almost double solution the damped steps are so small that a descent may end before it.
         """
         stays = False
         for _ in range(REFINEMENTS):
@@ -184,9 +186,10 @@ def one_solution(
     seed: FloatArray,
     count: int = BATCH,
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Solutions of a goal that leaves joints free, from the ``seed`` (n,) first, then from ``count`` other starts.
+    """Solutions of a goal that does not determine all joints, from the ``seed`` (n,) first, then from ``count`` other
+    starts.
 
-    As `all_solutions`: (s, n), residuals (s,), best approach (n,); none of them twice.
+    As `all_solutions`: (s, n), residuals (s,), closest approach (n,); without duplicates.
     """
     starts = np.concatenate([seed[None], even_starts(chain, limits, count - 1)])
     ends, left = descended(chain, points, targets, starts)
@@ -200,10 +203,10 @@ ITERATIONS = 60
 LONGEST = 0.7
 """Largest change of a joint in one step [rad or m]."""
 STALLED = 1e-10
-"""Share of the error by which a step has to lower it for another one to follow."""
+"""Relative decrease of the error below which a descent ends."""
 IDLE = 1e-20
-"""Damping that is always there, as a share of what the operators could do to the points: what rounding alone seems to
-move, a joint that the goal leaves free, stays where it is.
+"""Minimum damping, relative to the largest possible motion of the points by the operators: a joint that the goal does
+not determine stays at its position and is not moved by rounding errors.
 """
 
 
@@ -218,7 +221,7 @@ def _sum_of_squares(A: FloatArray) -> float:
 
 @kernel
 def _solve_damped(A: FloatArray, g: FloatArray, damping: float, L: FloatArray, x: FloatArray) -> bool:
-    """``(A + damping·I) x = -g`` by Cholesky in ``L`` (n, n); False where it is not positive."""
+    """Solve ``(A + damping·I) x = -g`` by Cholesky in ``L`` (n, n); False if the matrix is not positive definite."""
     n = g.shape[0]
     for i in range(n):
         for j in range(i + 1):
@@ -259,7 +262,9 @@ def _squared_error(moved: FloatArray, targets: FloatArray) -> float:
 def _normal_equations_into(
     rows: FloatArray, moved: FloatArray, targets: FloatArray, A: FloatArray, g: FloatArray
 ) -> float:
-    """Trace of ``A = JᵀJ`` (n, n), filled below its diagonal, with ``g = Jᵀ(x − x*)`` (n,), of ``rows`` J (n, m, 4)."""
+    """Fill ``A = JᵀJ`` (n, n) (lower triangle) and ``g = Jᵀ(x − x*)`` (n,) from ``rows`` J (n, m, 4); returns the trace
+    of ``A``.
+    """
     n, m = rows.shape[0], rows.shape[1]
     trace = 0.0
     for j in range(n):
@@ -287,10 +292,10 @@ def descend(
     iterations: int,
     damping0: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Ends (s, n) of descents from ``starts`` (s, n) on ``Σ |H(q)M - M*|²``, and that sum (s,).
+    """End points (s, n) of descents from ``starts`` (s, n) on ``Σ |H(q)M - M*|²``, and that sum (s,).
 
-    ``points``, ``targets`` (m, 4) of equal heights. ``damping0``: the first damping, as a share of the information's
-    mean diagonal.
+    ``points``, ``targets`` (m, 4) of equal heights. ``damping0``: the first damping, relative to the mean diagonal of
+    the information matrix.
     """
     s, n = starts.shape
     m = points.shape[0]
@@ -357,7 +362,7 @@ def descended(
     iterations: int = ITERATIONS,
     damping: float = 1e-2,
 ) -> tuple[FloatArray, FloatArray]:
-    """Run `descend` on ``chain``: ends (s, n) and their residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
+    """Run `descend` on ``chain``: end points (s, n) and residuals (s,), ``|H(q)M - M*| / |M*|`` over all points."""
     ends, errors = descend(
         Chain(chain.generators, chain.kind_codes, chain.zero, chain.tip_first),
         np.ascontiguousarray(points, dtype=np.float64),
@@ -370,8 +375,8 @@ def descended(
 
 
 def equivalent_points(points: FloatArray, targets: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Four points and their targets (4, 4) for ``points`` and ``targets`` (m, 4): of every 4x4 H the sum of squares
-    ``Σ |H M - M*|²`` is the same, but for what no H explains, and so are its derivatives.
+    """Four points and their targets (4, 4) for ``points`` and ``targets`` (m, 4): for every 4x4 H the sum of squares
+    ``Σ |H M - M*|²`` is the same up to the constant that no H explains, and its derivatives are the same.
     """
     Q, R = np.linalg.qr(points)
     return np.ascontiguousarray(R), np.ascontiguousarray(Q.T @ targets)

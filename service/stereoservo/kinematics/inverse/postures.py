@@ -1,5 +1,5 @@
-"""All postures in which a learnt arm shows given images: inverse kinematics of the triangulated set-points, each answer
-refined on the images (thesis 6, 6.8).
+"""All postures of a calibrated arm that show given images: inverse kinematics of the triangulated set-points, each
+solution refined on the images (thesis 6, 6.8).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 TOLERANCE = 0.05
-"""Residual, as a share, up to which measured points count as reached: the images judge what comes of them."""
+"""Relative residual up to which measured points count as reached: solutions are then verified on the images."""
 FEWEST = 3
 
 
@@ -37,9 +37,9 @@ FEWEST = 3
 class Postures:
     """Postures that show a goal's images.
 
-    ``recognition``: of the arm's structure; ``found``: what inverse kinematics of the triangulated points answers,
-    postures beyond the limits and how far an unreachable goal is with it; ``images``: the answers refined on the
-    images, nearest to the zero first (but for whole turns): an order that does not depend on the seed.
+    ``recognition``: of the arm's structure; ``found``: solutions of the inverse kinematics of the triangulated points,
+    with postures beyond the limits and the distance to an unreachable goal; ``images``: the solutions refined on the
+    images, nearest to the zero first (up to whole turns): this order does not depend on the seed.
     """
 
     recognition: Recognition
@@ -56,12 +56,12 @@ def postures(
     seed: FloatArray | None = None,
     recognition: Recognition | None = None,
 ) -> Postures:
-    """Postures of the arm of ``model`` in which its markers are at raw ``pixels`` (c, m, 2) [px] of deviation
+    """Postures of the arm of ``model`` in which its markers are at raw ``pixels`` (c, m, 2) [px] of standard deviation
     ``sigma``, NaN where a camera does not see one.
 
-    ``limits`` (n, 2) [rad or m]; ``seed`` (n,), default the zero: turns are counted to be nearest to it.
-    ``recognition``: of this model, where it is known. Raises InverseKinematicsError for images that share fewer than
-    three markers, or that are of no motion of this body; JointAnglesError.
+    ``limits`` (n, 2) [rad or m]; ``seed`` (n,), default the zero: whole turns are chosen nearest to it.
+    ``recognition``: of this model, if known. Raises InverseKinematicsError for images that share fewer than three
+    markers, or that no motion of this body explains; JointAnglesError.
     """
     seen = seen_chain(model)
     targets, _ = points_seen(seen, seen.chain.zero, pixels, sigma)
@@ -92,19 +92,19 @@ def postures(
 
 
 # -- refined on the images -----------------------------------------------------------------------------------
-# Joint angles for the images of a goal: each start from inverse kinematics is refined to the least reprojection error,
+# Joint angles from the images of a goal: each start from inverse kinematics is refined to the least reprojection error,
 # with covariance (thesis 6.8).
 
 
 MERGED = 1e-5
-"""Largest difference of joints [rad or m] of two refinements that ended in one minimum."""
+"""Largest difference of joints [rad or m] of two refinements that converged to the same minimum."""
 
 
 @dataclass(frozen=True, eq=False)
 class ImageSolutions:
-    """Configurations of least image error, one for each start that led to one, least cost first.
+    """Configurations of least image error, one for each successful start, least cost first.
 
-    ``refused``: starts (t, n) whose descent explains no image, with the reason of each.
+    ``refused``: starts (t, n) whose descent does not explain the images, each with the reason.
     """
 
     solutions: tuple[JointAngles, ...]
@@ -123,8 +123,8 @@ def refined_on_images(
     """Solutions ``found``, each refined to the least squares of (6.8), with covariance.
 
     ``points`` (m, 4) at the chain's zero, raw set-points ``pixels`` (c, m, 2) [px] of standard deviation ``sigma``, NaN
-    where a camera does not see one. Raises JointAnglesError for shapes and limits that do not fit, and for fewer
-    coordinates than joints.
+    where a camera does not see one. Raises JointAnglesError for wrong shapes and limits, and for fewer coordinates than
+    joints.
     """
     problem = joint_problem(seen, points, pixels, sigma)
     refined: list[JointAngles] = []

@@ -1,9 +1,9 @@
 """Recognition of chains with closed-form inverse kinematics by chi-square tests: parallel axes, axes through a common
 point, prismatic joints (thesis 6.3 to 6.7).
 
-A calibrated chain is so only within its covariance. Each condition is a set of incidences that vanish: they are tested
-by chi-square against the covariance propagated to them. A small deviation that the calibration cannot distinguish
-from none costs nothing: the closed form then starts a refinement on the chain as it is.
+A calibrated chain fulfils such conditions only within its covariance. Each condition is a set of vanishing incidences,
+which are tested by chi-square against the covariance propagated to them. A small deviation that the calibration cannot
+distinguish from zero is harmless: the closed form is then the start of a refinement on the actual chain.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 TAIL = 1e-4
-"""Probability with which chance alone makes a condition fail that holds."""
+"""Probability that a valid condition fails the test by chance."""
 EXACT = 1e-6
-"""Largest deviation of a chain, or of a model without a covariance."""
+"""Largest accepted deviation of a chain, or of a model without a covariance."""
 COARSEST = 0.05
-"""Largest deviation that is put down to the calibration's noise at all."""
+"""Largest deviation that may be explained by the calibration's noise."""
 PARALLEL_FREEDOM = 2
-"""Conditions that two directions are one, once both lie in the plane that all joints fix."""
+"""Number of conditions for two equal directions, if both lie in the plane that all joints leave invariant."""
 
 Condition = Literal["parallel", "common_point", "independent"]
 Test = Callable[[FloatArray], FloatArray]
@@ -39,9 +39,9 @@ Test = Callable[[FloatArray], FloatArray]
 class Evidence:
     """Test result of a condition on joints (counted from the base).
 
-    ``deviation``: sine, in the model's frame, of how far it is from holding exactly. ``chi2`` of ``freedom``
-    conditions, at most ``threshold`` where it holds. None without a covariance, where ``deviation`` is held against
-    `EXACT`, and above `COARSEST`.
+    ``deviation``: sine, in the model's frame, of the deviation from the exact condition. ``chi2`` of ``freedom``
+    conditions, at most ``threshold`` if the condition holds. None without a covariance, where ``deviation`` is compared
+    with `EXACT`, and above `COARSEST`.
     """
 
     condition: Condition
@@ -55,8 +55,8 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Recognition:
-    """Structure ``case`` of a chain. ``inverted``: that of its factors in reverse order, so for the inverse
-    displacement.
+    """Structure ``case`` of a chain. ``inverted``: the structure of its factors in reverse order, that is, for the
+    inverse displacement.
     """
 
     case: Case
@@ -67,8 +67,8 @@ class Recognition:
 def parallel_incidence(first: FloatArray, second: FloatArray) -> Test:
     """Test function (4,) of a pair of operators (2, 4, 4), linearised at ``first``, ``second`` (4, 4).
 
-    Zero where both move points in the same directions: the range of the second vanishes under the projection onto
-    the first's axis.
+    Zero if both move points in the same directions: the projection onto the first's axis maps the range of the second
+    to zero.
     """
     along = np.linalg.svd(first)[2][2:]
     across = np.linalg.svd(second)[0][:, :2]
@@ -82,9 +82,10 @@ def parallel_incidence(first: FloatArray, second: FloatArray) -> Test:
 
 
 def common_point_incidence(operators: FloatArray) -> Test:
-    """Test function of operators (k, 4, 4), linearised at those given: zero where one point lies on all axes.
+    """Test function of operators (k, 4, 4), linearised at those given: zero if one point lies on all axes.
 
-    The least singular vector of all operators in one stack, and what of its motion no other point takes back.
+    Uses the least singular vector of the stacked operators: the part of its motion that no change of the point
+    compensates.
     """
     sizes = np.linalg.norm(operators, axis=(1, 2), keepdims=True)
     U, _, rows = np.linalg.svd((operators / sizes).reshape(-1, 4))
@@ -110,11 +111,11 @@ class _ConditionTest:
 
     def common_point(self, *joints: int) -> bool:
         test = common_point_incidence(self.chain.generators[list(joints)])
-        # Two conditions for each axis through a point, less the three coordinates of the point.
+        # Two conditions for each axis through a point, minus the three coordinates of the point.
         return self._holds("common_point", joints, test, 2 * len(joints) - 3)
 
     def spherical(self, *joints: int) -> bool:
-        # Parallel axes meet, too, in the plane that stays fixed.
+        # Parallel axes intersect, too, in the invariant plane.
         meet = self.common_point(*joints)
         return meet and not (self.parallel(*joints[:2]) or self.parallel(*joints[1:]))
 
@@ -137,7 +138,7 @@ class _ConditionTest:
         if self.model is None or deviation > COARSEST:
             return Evidence(condition, joints, deviation <= EXACT, deviation)
         values, covariance = propagated(self.model, lambda model: test(model.generators[chosen]))
-        # More incidences than conditions: what is beyond them varies in second order only.
+        # More incidences than conditions: the additional ones vary only in second order.
         variances, vectors = np.linalg.eigh(covariance)
         variances, vectors = variances[-freedom:], vectors[:, -freedom:]
         statistic = float(((vectors.T @ values) ** 2 / variances).sum())
@@ -148,7 +149,7 @@ class _ConditionTest:
 def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
     """Structure of a chain, or of a calibrated model, whose covariance then sets the tolerance of each condition.
 
-    Conditions are incidences of operators, in any stratum. ``numerical`` where no closed form fits.
+    Conditions are incidences of operators, in any stratum. ``numerical`` if no closed form applies.
     """
     model = arm if isinstance(arm, CellModel) else None
     chain = chain_of(arm)
@@ -156,7 +157,7 @@ def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
     order = chain.order
     for inverted, joints in ((False, order), (True, order[::-1])):
         case = _case(judge, chain.kinds, joints)
-        # Single points say nothing of a displacement's inverse; short chains read the same both ways.
+        # Single points do not determine the inverse displacement; short chains are the same in both orders.
         if case is not None and not (inverted and case in ("two_revolute", "two_parallel", "wrist")):
             return Recognition(case, inverted, tuple(judge.evidence.values()))
     return Recognition("numerical", False, tuple(judge.evidence.values()))
@@ -174,8 +175,8 @@ def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tup
 
 
 def structure(arm: ProjectiveChain | CellModel) -> tuple[Evidence, ...]:
-    """What holds of neighbouring revolute axes, from the base on: two that are parallel or meet, three that do so in
-    one point, which replace the pairs that they contain.
+    """Conditions that hold for adjacent revolute axes, from the base on: two that are parallel or intersect, three that
+    intersect in one point, which replace the pairs that they contain.
     """
     chain = chain_of(arm)
     turning = [j for j in chain.order if chain.kinds[j] == "revolute"]

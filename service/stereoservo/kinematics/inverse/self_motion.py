@@ -1,4 +1,4 @@
-"""Self-motions, joint motions that leave the goal reached, of redundant arms and at singular configurations: their
+"""Self-motions (joint motions that keep the goal reached) of redundant arms and at singular configurations: their
 directions, and the solution along them that is nearest to a seed or inside the joint limits.
 """
 
@@ -11,23 +11,23 @@ from stereoservo.kinematics.inverse.numerical import linearised
 from stereoservo.numerics.arrays import FloatArray
 
 NO_MOTION = 1e-6
-"""Singular value of the joints' Jacobian, as a share of the largest, below which a direction moves nothing."""
+"""Singular value of the Jacobian, relative to the largest, below which a direction does not move the points."""
 PROBE = 0.05
 PROBES = (0.2 * PROBE, -0.5 * PROBE, PROBE)
-"""Motions [rad or m] after which a direction still has to leave the goal reached: a stretched elbow's does not."""
+"""Motions [rad or m] after which the goal must still be reached: it is not for a stretched elbow."""
 STRICTER = 0.02
-"""Share of the tolerance for that: before a wrist that is nearly aligned a stretched elbow hardly has to move."""
+"""Fraction of the tolerance for that test: with a nearly aligned wrist, a stretched elbow hardly moves."""
 STRIDE = 0.4
-"""Longest step [rad or m] towards a seed; halved where the goal is lost, or the seed is no nearer after it."""
+"""Longest step [rad or m] towards a seed; halved if the goal is lost, or if the step does not approach the seed."""
 CORRECTIONS = 20
 SETTLED = 1e-6
-"""Step [rad or m] of a correction that is its last: what is left of a measured goal is noise."""
+"""Step [rad or m] at which a correction has converged: the remainder of a measured goal is noise."""
 
 
 def null_directions(chain: ProjectiveChain, points: FloatArray, q: FloatArray) -> FloatArray:
     """Null space (k, n), orthonormal, of the Jacobian of ``points`` (m, 4) at ``q`` (n,).
 
-    Joints are weighed as they move the points, so that units do not matter.
+    Joints are weighted by their motion of the points, so units do not matter.
     """
     moved, J, operators = linearised(chain, points, q)
     sizes = np.linalg.norm(J, axis=0)
@@ -66,7 +66,7 @@ def self_motions(
 ) -> FloatArray:
     """Null-space directions (k, n) at ``q`` (n,) along which the goal stays reached over a finite distance.
 
-    A direction that does so to first order only, at the rim of the workspace, is none.
+    Directions for which this holds only to first order, at the boundary of the workspace, are excluded.
     """
     kept = []
     for direction in null_directions(chain, points, q):
@@ -97,7 +97,7 @@ def nearest_by_self_motion(
     seed: FloatArray,
     tolerance: float,
 ) -> FloatArray:
-    """Configuration nearest to ``seed`` (n,) that a self-motion from ``q`` (n,) reaches with the goal kept."""
+    """Configuration nearest to ``seed`` (n,) along self-motions from ``q`` (n,), with the goal reached."""
     stride = STRIDE
     for _ in range(200):
         kernel = null_directions(chain, points, q)
@@ -125,7 +125,7 @@ def slid_inside(
 ) -> FloatArray | None:
     """Configuration (n,) inside ``limits`` (n, 2) along the single self-motion of ``q`` (n,), or None.
 
-    Follows the motion in both directions for a full turn, or until it comes to its end.
+    Follows the motion in both directions for a full turn, or to its end.
     """
     kernel = null_directions(chain, points, q)
     if len(kernel) != 1:

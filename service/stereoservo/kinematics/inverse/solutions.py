@@ -26,10 +26,10 @@ Outcome = Literal["isolated", "continuum", "beyond_limits", "unreachable"]
 
 
 class InverseKinematicsError(ValueError):
-    """Invalid goal, seed or limits of inverse kinematics; the text states what would be valid.
+    """Invalid goal, seed or limits of inverse kinematics; the message states the valid values.
 
     Attributes:
-        code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion takes the points there), ``not_rigid``,
+        code: ``shape``, ``not_finite``, ``mirrored`` (no rigid motion maps the points to the targets), ``not_rigid``,
             ``degenerate`` (a goal or point on the fixed plane), ``limits``.
         data: the values in the message.
     """
@@ -42,11 +42,11 @@ class InverseKinematicsError(ValueError):
 
 @dataclass(frozen=True, eq=False)
 class Shortfall:
-    """Closest approach of an arm to a goal that is out of its reach.
+    """Closest approach of an arm to an unreachable goal.
 
-    ``joints`` (n,) of least residual among the approaches tried, ``residual`` as in `InverseSolutions`. ``joint``:
-    whose equation has no root, in closed form; ``excess``: by which share of its amplitude (1.0: twice as far as it
-    reaches; infinite: it moves nothing that matters). None where no single joint is the reason.
+    ``joints`` (n,) of least residual among the approaches tried, ``residual`` as in `InverseSolutions`. ``joint``: the
+    joint whose equation has no root, in closed form; ``excess``: the distance from a root relative to its amplitude
+    (1.0: twice as far as it reaches; infinite: it has no effect). None if no single joint is the cause.
     """
 
     joints: FloatArray
@@ -63,10 +63,10 @@ class InverseSolutions:
     over that of ``M*``, points at equal heights (for a displacement the columns of H). Revolute angles are those
     nearest to the seed, by whole turns, inside the limits.
 
-    ``outcome``: ``isolated`` solutions; ``continuum``, where the goal leaves joints free (singular, or more
-    joints than freedoms), each row one representative; ``beyond_limits``, all of them outside; ``unreachable``.
-    ``self_motions``: for each row directions (k, n) at unit norm along which the arm moves and the goal stays.
-    ``beyond_limits`` (t, n): solutions outside of the limits. ``shortfall`` where unreachable.
+    ``outcome``: ``isolated`` solutions; ``continuum``, if the goal does not determine all joints (singular, or more
+    joints than degrees of freedom), each row one representative; ``beyond_limits``: all are outside; ``unreachable``.
+    ``self_motions``: for each row unit directions (k, n) along which the arm moves and the goal stays reached.
+    ``beyond_limits`` (t, n): solutions outside the limits. ``shortfall`` if unreachable.
     """
 
     case: Case
@@ -92,9 +92,9 @@ class InverseSolutions:
 
 
 MOVING = 1e-4
-"""Share of a self-motion's direction from which on a joint counts as moving."""
+"""Component of a self-motion's direction from which on a joint counts as moving."""
 SAME = 1e-6
-"""Largest difference of joints [rad or m] of two answers that are one."""
+"""Largest difference of joints [rad or m] of two solutions that count as equal."""
 
 
 def nearest_turns(kinds: tuple[str, ...], joints: FloatArray, seed: FloatArray) -> FloatArray:
@@ -109,7 +109,7 @@ def within_limits(
 ) -> tuple[FloatArray, bool]:
     """Joints (n,) by whole turns inside ``limits`` (n, 2), nearest to ``seed`` (n,); whether all of them are.
 
-    A joint that no whole turn brings inside is as near to its limits as whole turns allow.
+    A joint that cannot be inside is as near to its limits as whole turns allow.
     """
     near = nearest_turns(kinds, joints, seed)
     if limits is None:
@@ -123,7 +123,7 @@ def within_limits(
             bound = low if near[j] < low else high
             turns = (bound - near[j]) / (2.0 * np.pi)
             moved = near[j] + 2.0 * np.pi * (np.ceil(turns) if near[j] < low else np.floor(turns))
-            # Past the other limit by less than it lacks here: as near as it gets.
+            # Past the other limit by less than the distance here: this is the nearest.
             if low <= moved <= high:
                 near[j] = moved
                 continue
@@ -134,7 +134,7 @@ def within_limits(
 
 
 def distinct(kinds: tuple[str, ...], joints: FloatArray, tolerance: float = SAME) -> list[int]:
-    """Indices of rows (s, n) of which none equals an earlier one, up to whole turns."""
+    """Indices of the rows (s, n) that do not equal an earlier one, up to whole turns."""
     kept: list[int] = []
     for i, row in enumerate(joints):
         difference = nearest_turns(kinds, joints[kept] - row, np.zeros(len(row)))

@@ -1,7 +1,7 @@
 """Inverse kinematics of an arm in the cameras' projective frame, all configurations that reach a goal: recognition of
 the arm's structure, closed-form or numerical candidates, refinement, checks.
 
-In every stratum: operators and points suffice (thesis 6). Neither a metric nor the plane at infinity is used.
+Valid in every stratum: operators and points suffice (thesis 6); neither a metric nor the plane at infinity is used.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
 
 TOLERANCE = 1e-8
-"""Residual up to which a goal counts as reached: rounding, for goals that are exact."""
+"""Residual up to which a goal counts as reached: rounding, for exact goals."""
 WITNESSES = 4
-"""Points of a goal that are tried in the cases that work on a single one."""
+"""Number of points of a goal that are tried in the cases that use a single point."""
 RIGID = 3
-"""Number of points from which a goal shows whether it is a rigid motion."""
+"""Number of points from which on it can be tested whether a goal is a rigid motion."""
 ROUNDING = 1e-9
 FREEDOMS = 6
 EXACT_GOALS = 1e-6
@@ -68,7 +68,7 @@ WHOLE_ROTATION: dict[Case, Callable[[FloatArray, FloatArray, FloatArray], Branch
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
-    """A goal in normal form: points and targets (m, 4) of equal scales; the displacement where they determine it."""
+    """A goal in normal form: points and targets (m, 4) of equal scales; the displacement if they determine it."""
 
     chain: ProjectiveChain
     points: FloatArray
@@ -93,14 +93,13 @@ def inverse_kinematics(
     """Inverse kinematics: all configurations that reach a goal.
 
     The goal is a ``displacement`` (4, 4) from the chain's zero, of any scale, or ``targets`` (m, 4) of ``points``
-    (m, 4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions, and is where a joint
-    stays that the goal leaves free. ``limits`` (n, 2) [rad or m]; prismatic joints need theirs where there is no
-    closed form.
-    ``tolerance``: residual up to which a goal counts as reached; measured goals need that of their noise.
-    ``recognition``: of this arm, where it is known already (of a model with a covariance it takes a second).
+    (m, 4) at the zero, of any heights. ``seed`` (n,), default the zero, orders the solutions; joints that the goal does
+    not determine stay there. ``limits`` (n, 2) [rad or m]; required for prismatic joints if there is no closed form.
+    ``tolerance``: residual up to which a goal counts as reached; for measured goals it must correspond to their noise.
+    ``recognition``: of this arm, if already known (for a model with a covariance it takes a second).
 
-    Raises InverseKinematicsError for goals that are no motion of this kind of arm (mirrored, another body), for shapes
-    that do not fit and for what is not finite. Out of reach and out of limits are answers, not errors.
+    Raises InverseKinematicsError for goals that no motion of this kind of arm explains (mirrored, another body), for
+    wrong shapes and for values that are not finite. Out of reach and out of limits are results, not errors.
     """
     chain = chain_of(mechanism)
     problem = _problem(chain, displacement, points, targets, seed, limits, tolerance)
@@ -141,7 +140,7 @@ def _problem(
         raise InverseKinematicsError("shape", f"tolerance {tolerance}; between 0 and 1 is needed")
     if displacement is not None and points is None and targets is None:
         H = scaled_displacement(chain.generators, displacement)
-        # A displacement is what it does to the columns of the identity.
+        # A displacement is represented by its images of the columns of the identity.
         return _Problem(chain, np.eye(4), np.ascontiguousarray(H.T), H, seed, limits, tolerance)
     if displacement is None and points is not None and targets is not None:
         at_zero, at_goal = equal_scales(chain.generators, points, targets)
@@ -150,15 +149,13 @@ def _problem(
 
 
 def _displacement(problem: _Problem, known: Recognition) -> FloatArray | None:
-    """The displacement that the goal's points determine, where the closed form needs it or they are of a rigid
-    body.
-    """
+    """The displacement that the goal's points determine, if the closed form needs it or they belong to a rigid body."""
     if problem.displacement is not None:
         return problem.displacement
     needless = not known.inverted and known.case not in WHOLE_ROTATION
     if needless and len(problem.points) < RIGID:
         return None
-    # Of a learnt arm of few joints nobody knows the group of motions: noise of its operators generates all of them.
+    # The motion group of a calibrated arm of few joints is unknown: noise of its operators generates all motions.
     if needless and problem.chain.joints < FREEDOMS and problem.tolerance > EXACT_GOALS:
         return None
     misfit = max(problem.tolerance, ROUNDING)
@@ -166,8 +163,8 @@ def _displacement(problem: _Problem, known: Recognition) -> FloatArray | None:
 
 
 def _closed_form(problem: _Problem, known: Recognition) -> Branches | None:
-    """Candidates of the recognised case, columns in the order of the chain's joints; None where there is no closed
-    form, or none for this goal.
+    """Candidates of the recognised case, columns in the order of the chain's joints; None if there is no closed form,
+    or none for this goal.
     """
     order = list(problem.chain.order[::-1] if known.inverted else problem.chain.order)
     sense = -1.0 if known.inverted else 1.0
@@ -229,7 +226,7 @@ def _searched(problem: _Problem) -> InverseSolutions:
 
 
 def _rank(problem: _Problem) -> int:
-    """Number of degrees of freedom of the goal that the joints drive, where they drive most of them."""
+    """Number of degrees of freedom of the goal that the joints move, at the configuration where they move most."""
     most = 0
     for q in numerical.even_starts(problem.chain, problem.limits, 4):
         J = linearised(problem.chain, problem.points, q)[1]
@@ -306,17 +303,17 @@ def _nothing(problem: _Problem, case: Case, shortfall: Shortfall) -> InverseSolu
 # Normal form of the goals of inverse kinematics: points at the joints' zero, and targets of the same homogeneous
 # scale; planes that all joints leave fixed, and the Lie algebra of their motions.
 #
-# All displacements of a chain fix some plane, ``aᵀĤ_j = 0``: that at infinity, or one of a pencil where all axes are
-# parallel. Either gives the scales that they preserve; which one it is does not matter here.
+# All displacements of a chain leave some plane invariant, ``aᵀĤ_j = 0``: that at infinity, or one of a pencil if all
+# axes are parallel. Each gives the scales that they preserve; it does not matter which one is used.
 
 
 PLANE_TOLERANCE = 1e-12
-"""Share of its norm below which a point's height counts as none."""
+"""Height of a point, relative to its norm, below which it counts as zero."""
 RANK_TOLERANCE = 1e-6
 FIT_STEPS = 60
 STARTS = 24
 CANDIDATES = 64
-"""Planes of a pencil that are tried."""
+"""Number of planes of a pencil that are tried."""
 SETTLED = 1e-14
 WHOLE_GROUP = 6
 """Dimension of the algebra of all rigid motions."""
@@ -339,7 +336,8 @@ def finite(name: str, array: FloatArray, shape: tuple[int | None, ...]) -> Float
 def fixed_planes(generators: FloatArray) -> FloatArray:
     """Orthonormal basis (k, 4) of the planes that all ``generators`` (n, 4, 4) leave invariant, ``aᵀĤ_j = 0``.
 
-    One, or where axes are parallel or joints few a pencil or bundle; at least the one that comes nearest to it.
+    One plane, or a pencil or bundle if axes are parallel or there are few joints; at least the plane that is nearest to
+    invariant.
     """
     unit = generators / np.linalg.norm(generators, axis=(1, 2), keepdims=True)
     U, singular, _ = np.linalg.svd(np.concatenate(list(unit), axis=1))
@@ -359,11 +357,10 @@ def clear_plane(planes: FloatArray, points: FloatArray) -> FloatArray:
 
 
 def scaled_displacement(generators: FloatArray, H: FloatArray) -> FloatArray:
-    """``H`` (4, 4), given up to scale and sign, scaled such that it preserves the plane that the chain leaves
-    invariant.
+    """``H`` (4, 4), given up to scale and sign, scaled so that it preserves the plane that the chain leaves invariant.
 
-    Half a turn included, where the trace determines no sign. Raises InverseKinematicsError where it is a reflection,
-    singular, or does not fix the plane at all.
+    Also valid for half a turn, where the trace does not determine the sign. Raises InverseKinematicsError if it is a
+    reflection, singular, or does not preserve the plane.
     """
     H = finite("displacement", H, (4, 4))
     size = float(np.linalg.norm(H))
@@ -387,7 +384,7 @@ def equal_scales(generators: FloatArray, points: FloatArray, targets: FloatArray
     """``points`` (m, 4) unchanged, and ``targets`` (m, 4) scaled to the same value on a plane that all joints leave
     invariant.
 
-    Raises InverseKinematicsError for shapes that do not fit, and for a point or target on that plane.
+    Raises InverseKinematicsError for wrong shapes, and for a point or target on that plane.
     """
     points, targets = finite("points", points, (None, 4)), finite("targets", targets, (None, 4))
     if points.shape != targets.shape or not len(points):
@@ -416,7 +413,8 @@ def equal_scales(generators: FloatArray, points: FloatArray, targets: FloatArray
 def motion_algebra(generators: FloatArray) -> FloatArray:
     """Lie algebra generated by the joints, as an orthonormal basis (k, 4, 4): k = 6 for most arms, never more.
 
-    Every displacement of the chain is a product of exponentials of it. Of a noisy model the strongest six.
+    Every displacement of the chain is a product of exponentials of its elements. For a noisy model, the strongest six
+    directions.
     """
     members = [G / np.linalg.norm(G) for G in generators]
     basis = np.zeros((0, 16))
@@ -433,10 +431,10 @@ def displacement_between(
 ) -> FloatArray | None:
     """Displacement (4, 4) in the group generated by the joints that moves points (m, 4) closest to targets.
 
-    Three points that are not collinear will do: the group consists of rigid motions, so that no metric is needed. Equal
-    heights. None where the points leave it open, or the joints do not generate all rigid motions and none of theirs
-    fits. Raises InverseKinematicsError, ``not_rigid``, where no rigid motion does: a residual above ``misfit`` (the
-    norm of what is left, over that of the targets).
+    Three points that are not collinear suffice: the group consists of rigid motions, so no metric is needed. Equal
+    heights. None if the points do not determine it, or if the joints do not generate all rigid motions and none of
+    theirs fits. Raises InverseKinematicsError, ``not_rigid``, if no rigid motion fits: a residual above ``misfit``
+    (norm of the residual divided by that of the targets).
     """
     algebra = motion_algebra(generators)
     slopes = (algebra @ points.T).transpose(0, 2, 1).reshape(len(algebra), -1)
@@ -449,7 +447,7 @@ def displacement_between(
         try:
             first = np.eye(4) if start == 0 else _turned(algebra, rng)
             H, residual = _fitted(algebra, points, targets, first)
-        except GeometryError:  # not a rigid motion by its eigenvalues: another start may do
+        except GeometryError:  # not a rigid motion by its eigenvalues: another start may succeed
             continue
         if residual < least:
             best, least = H, residual
