@@ -168,7 +168,7 @@ SEGMENT_PX = 0.5
 
 @dataclass(frozen=True)
 class CommonFeatures:
-    """Features that determine a workpiece's motion: ids of ``points``, ``lines`` by two ids each, ``planes`` by points."""
+    """Features that determine a workpiece's motion, by ids: ``points``, two per line, and the points of ``planes``."""
 
     points: tuple[int, ...]
     lines: tuple[tuple[int, int], ...]
