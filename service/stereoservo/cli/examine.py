@@ -307,7 +307,7 @@ STATED_PX = 0.1
 LARGEST = 10**9
 """Largest value of integers: markers, sizes, counts of frames."""
 UNIT = 1e-2
-"""Tolerance of the norm of a quaternion."""
+"""Largest deviation of a quaternion's norm from 1."""
 
 Rows = list[dict[str, str]]
 

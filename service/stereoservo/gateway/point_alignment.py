@@ -168,7 +168,10 @@ SEGMENT_PX = 0.5
 
 @dataclass(frozen=True)
 class CommonFeatures:
-    """Features that determine a workpiece's motion, by ids: ``points``, two per line, and the points of ``planes``."""
+    """Features that determine a workpiece's motion.
+
+    ``points``: ids; ``lines``: two ids each; ``planes``: ids of their points.
+    """
 
     points: tuple[int, ...]
     lines: tuple[tuple[int, int], ...]
