@@ -1,4 +1,4 @@
-"""Contract tests, as pytest classes: what every joint driver, camera driver and detector must fulfil.
+"""Contract tests, as pytest classes: requirements for every joint driver, camera driver and detector.
 
 Subclass one in your own tests, override the factory of your driver, and run pytest::
 

@@ -24,7 +24,7 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
     """Decode ``options`` as ``kind``, a struct that forbids unknown fields.
 
     Raises:
-        DriverError: code ``option``; names the driver, the option, its value and what would have been valid.
+        DriverError: code ``option``; names the driver, the option, its value and the valid values.
     """
     try:
         return msgspec.convert(dict(options), kind, strict=True)

@@ -55,8 +55,8 @@ class SlcanBus(can.BusABC):
     """A CAN bus behind a Lawicel-style adapter.
 
     ``channel``: a serial device (``/dev/ttyACM0``, ``/dev/ttyUSB0@1000000``), a pty, or ``socket://HOST:PORT``.
-    ``bitrate``: set on the adapter (None: left as it is). ``send_timeout_s``: how long a full line may hold a send up.
-    ``reply_timeout_s``: how long an answer to a command is awaited; adapters that give none cost it thrice at opening.
+    ``bitrate``: set on the adapter (None: unchanged). ``send_timeout_s``: time limit of a send on a full line.
+    ``reply_timeout_s``: time limit of answers to commands; adapters without answers need it three times at opening.
     One thread may receive while others send. A malformed line is skipped and counted (``malformed``, the last one
     in ``last_malformed``).
 
@@ -201,9 +201,9 @@ class SlcanBus(can.BusABC):
         """Send ``frames`` in one write. ``timeout`` [s] replaces ``send_timeout_s``.
 
         Raises:
-            can.CanTimeoutError: the line takes no more.
+            can.CanTimeoutError: the line accepts no more data.
             can.CanOperationError: the connection is lost (``SlcanLostError``), or an earlier frame was refused
-                (``SlcanRefusedError``); in the latter case these are sent all the same.
+                (``SlcanRefusedError``); in the latter case these are sent nevertheless.
         """
         self._write(b"".join([encode_frame(frame) for frame in frames]), timeout)
         self._check()
@@ -310,7 +310,7 @@ class SlcanPort:
 
         Raises:
             PortLostError: the other side is gone.
-            OSError: anything else that the system says.
+            OSError: any other system error.
         """
         if not (timeout_s == 0 and self._tells_its_end) and not select.select(self._fd, (), (), timeout_s)[0]:
             return b""
@@ -329,7 +329,7 @@ class SlcanPort:
 
         Raises:
             PortLostError: the other side is gone.
-            OSError: anything else that the system says.
+            OSError: any other system error.
         """
         deadline = None
         while content:

@@ -1,7 +1,7 @@
 """Codec of Lawicel's serial-line CAN protocol: frames as text lines, lines from a byte stream. For host and
 adapter.
 
-A line ends with CR; BEL alone says that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
+A line ends with CR; a BEL alone means that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
 (29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits.
 Source: LAWICEL AB, CANUSB manual, "CANUSB ASCII commands".
 """
@@ -61,7 +61,7 @@ def encode_frame(frame: CanFrame) -> bytes:
     """Encode ``frame`` as a line with its end.
 
     Raises:
-        ValueError: id, data or length that no classical frame has.
+        ValueError: id, data or length is not valid in a classical frame.
     """
     if not (frame.remote or frame.extended):
         return _head(frame.id, len(frame.data)) + hexlify(frame.data).upper() + CR
@@ -92,7 +92,7 @@ def decode_frame(line: bytes) -> CanFrame:
     """Decode a frame from its ``line`` without the end, with or without a time stamp.
 
     Raises:
-        LineError: it is not one.
+        LineError: the line is not a frame.
     """
     return _usual_frame(line) or _any_frame(line)
 
@@ -139,7 +139,7 @@ def bitrate_command(bitrate: int) -> str:
     """Command ``S0`` … ``S8`` of a bit rate.
 
     Raises:
-        ValueError: a bitrate that adapters of this kind cannot be asked for; lists the others.
+        ValueError: a bit rate without a command in this protocol; lists the valid ones.
     """
     if bitrate not in BITRATES:
         valid = ", ".join(f"{known}" for known in BITRATES)

@@ -279,7 +279,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Line:
-    """A hairline [mm]; dashed where paper is folded."""
+    """A hairline [mm]; dashed for a fold."""
 
     x0: float
     y0: float

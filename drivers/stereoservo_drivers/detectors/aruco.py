@@ -308,7 +308,7 @@ def _opencv_detector(options: TagOptions, least_window: int) -> cv2.aruco.ArucoD
     parameters.cornerRefinementMethod = _METHODS[options.refinement]
     # the registration's own reading tolerates bits flipped by noise; without it the code must be exact
     parameters.errorCorrectionRate = 1.0 if options.refinement == "pattern" else 0.0
-    # in OpenCV's order, the white margin's outline on a darker wall replaces the tag's: one in seven is lost
+    # by default, the white margin's outline on a darker wall replaces the tag's: one in seven is lost
     parameters.minMarkerDistanceRate = 0.02
     parameters.minGroupDistance = 0.05
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25

@@ -71,7 +71,7 @@ def whole(dot, lopsided):
 
 @kernel
 def median(values, used):
-    """The median of ``values`` (n,) that are ``used`` (n,), the lower one of two; 0 where none is."""
+    """The median of ``values`` (n,) that are ``used`` (n,), the lower one of two; 0 if none is used."""
     chosen = np.empty(values.size)
     n = 0
     for i in range(values.size):

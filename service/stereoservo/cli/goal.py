@@ -79,7 +79,7 @@ def feature_tree(found: tuple[SetPoints, ...]) -> dict[str, Any]:
 
 
 def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
-    """Raise CommandError where a recording does not match a camera of the live cell in its present setup."""
+    """Raise CommandError if a recording does not match a camera of the live cell in its current setup."""
     if not found:
         return
     cameras = {camera.name: (camera.width, camera.height) for camera in client.info().cameras}

@@ -152,7 +152,7 @@ def _silence(what: str, age_s: float | None) -> str:
 
 
 def progress_words(state: StateMessage) -> str:
-    """Progress of the active goal as text; empty where it is unknown."""
+    """Progress of the active goal as text; empty if it is unknown."""
     words = []
     if state.progress is not None:
         words.append(f"{100.0 * state.progress:.0f} % of its path")
@@ -164,7 +164,7 @@ def progress_words(state: StateMessage) -> str:
 
 
 def _health(state: StateMessage) -> list[str]:
-    """Text: agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
+    """Text: agreement of each camera with the model, the diagnosis if it is poor, and wrong stamps."""
     health = state.health
     if health.verdict == "unknown" and not health.text:
         return []

@@ -185,7 +185,7 @@ class Journal:
 
     @property
     def note(self) -> str:
-        """Text on lines that are missing; empty where there are none."""
+        """Text on lines that are missing; empty if there are none."""
         return f"{self._path}: {self._lost} events are missing in it: {self._cause}" if self._cause else ""
 
     def _open(self) -> FileIO:

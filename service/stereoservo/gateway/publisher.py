@@ -203,7 +203,7 @@ class Previews:
         self._asked = 0.0
 
     def poll(self) -> None:
-        """Publish the available pictures. Raises what a decoder raises."""
+        """Publish the available pictures. Raises the exceptions of a decoder."""
         now = time.monotonic()
         if now - self._asked > PREVIEW_ASK_S:
             self._asked = now

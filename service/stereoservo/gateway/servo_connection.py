@@ -57,7 +57,7 @@ class ServoConnection:
 
     @property
     def note(self) -> str:
-        """Text on messages that could not be read; empty where there were none."""
+        """Text on messages that could not be read; empty if there were none."""
         return self._boundary.note
 
     @property
