@@ -25,10 +25,11 @@ from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
 SIGMA_PX = 0.1
-"""Standard deviation of a corner, an axis [px]: of sharp pictures; a calibration finds its own."""
+"""Standard deviation of a corner per axis [px], for sharp pictures; a calibration estimates its own."""
 WINDOW_SHARE = 0.3
-"""Half the side of the window of the refinement, as a share of the least distance of two corners: with 0.4, what lies
-beside a slanted board has drawn a corner off by 4 px."""
+"""Half the side of the refinement window, as a share of the least distance of two corners: with 0.4, structures beside
+a slanted board have shifted a corner by 4 px.
+"""
 LARGEST_WINDOW = 11
 ITERATIONS, CONVERGED = 60, 1e-4
 
@@ -41,11 +42,11 @@ class ChessboardOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
 
 class ChessboardDetector:
-    """Detects all inner corners of one board, or none; ids row by row, from the corner inside and outside which the
-    squares are dark.
+    """Detects all inner corners of one board, or none; ids row by row, from the corner whose inner and outer squares
+    are dark.
 
-    One count must be odd and the other even: else half a turn of the board looks alike. Raises DriverError: ``option``
-    at construction, ``image_format`` by :meth:`detect`; content never raises.
+    One count must be odd and the other even; otherwise the board looks the same after half a turn. Raises DriverError:
+    ``option`` at construction, ``image_format`` by :meth:`detect`; content never raises.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -78,7 +79,9 @@ class ChessboardDetector:
 
 
 def find_corners(image: ImageArray, columns: int, rows: int) -> FloatArray | None:
-    """Inner corners (rows * columns, 2) [px] of the board in ``image``, row by row; None where it is not seen whole."""
+    """Inner corners (rows * columns, 2) [px] of the board in ``image``, row by row; None if it is not completely
+    visible.
+    """
     flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
     found, corners = cv2.findChessboardCorners(image, (columns, rows), flags=flags)
     if not found:
@@ -91,14 +94,14 @@ def find_corners(image: ImageArray, columns: int, rows: int) -> FloatArray | Non
     grid = np.asarray(refined, dtype=np.float64).reshape(rows, columns, 2)
     along, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     if along[0] * down[1] - along[1] * down[0] < 0.0:
-        grid = grid[::-1]  # counted against the clock: the board is seen from its front
+        grid = grid[::-1]  # counted counter-clockwise: the board is seen from its front
     if _first_is_bright(image, grid):
         grid = grid[::-1, ::-1]
     return np.ascontiguousarray(grid.reshape(-1, 2))
 
 
 def _first_is_bright(image: ImageArray, grid: FloatArray) -> bool:
-    """Whether the square inside the first corner is one of the bright ones: by all squares, since one may glare."""
+    """Whether the square inside the first corner is a bright one, judged from all squares, since one may have glare."""
     middles = 0.25 * (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:])
     smooth = cv2.blur(image, (3, 3))
     u, v = np.clip(np.round(middles), 0, np.array(image.shape[::-1]) - 1).astype(int).transpose(2, 0, 1)

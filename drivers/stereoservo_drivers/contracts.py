@@ -1,4 +1,4 @@
-"""Contract tests, as pytest classes: what every joint driver, camera driver and detector must fulfil.
+"""Contract tests, as pytest classes: requirements for every joint driver, camera driver and detector.
 
 Subclass one in your own tests, override the factory of your driver, and run pytest::
 
@@ -35,13 +35,11 @@ from stereoservo_drivers.kit.bench import JointDriverSetup, Paced, call_times_us
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, JointCheck, run_check
 
 # -- time ----------------------------------------------------------------------------------------------------
-# Time in contract tests: virtual where the device simulates, real where it does not; measured call budgets.
+# Time in contract tests: virtual if the device simulates, real if it does not; measured call budgets.
 
 
 class PacedSuite(Paced):
-    """Common base of the contract tests. Override :attr:`real_time` and :meth:`make_context` where a device needs
-    it.
-    """
+    """Common base of the contract tests. Override :attr:`real_time` and :meth:`make_context` if a device needs it."""
 
     @pytest.fixture
     def context(self, tmp_path: Path) -> DriverContext:
@@ -76,12 +74,12 @@ class CameraDriverContract(PacedSuite):
 
     camera_name = "left"
     frames = 5
-    """How many frames a test waits for."""
+    """Number of frames that a test waits for."""
     patience_s = 5.0
-    """How long a test waits for them on the driver's clock."""
+    """Time limit of waiting for frames on the driver's clock."""
 
     def make_driver(self, context: DriverContext) -> CameraDriver:
-        """A new driver, connected to nothing."""
+        """A new driver, not connected."""
         raise NotImplementedError("override make_driver(context)")
 
     def make_context(self, tmp_path: Path) -> DriverContext:
@@ -193,7 +191,7 @@ class CameraDriverContract(PacedSuite):
         active.close()
 
     def test_can_be_opened_again_after_close(self, active: CameraDriver, context: DriverContext) -> None:
-        """How the vision process answers every error of a camera."""
+        """Reaction of the vision process to any error of a camera."""
         first = self.collect(active, context, 1)[-1]
         active.close()
         active.configure()
@@ -250,22 +248,22 @@ def check_observation(observation: CameraObservation, marker_ids: tuple[int, ...
 class DetectorContract(PacedSuite):
     """Base class of the tests: subclass under pytest; override :meth:`make_detector` and :meth:`make_scene`.
 
-    What a detector must keep whatever it is shown: well-formed answers, no exception, no memory of the
-    caller's arrays, the same answer to the same question.
+    Requirements for any image: well-formed observations, no exception, no references to the caller's arrays, the same
+    observation for the same input.
     """
 
     camera_name = "left"
     accuracy_px = 0.5
     """Largest distance of a reported marker from the truth in the scene."""
     least_markers = 4
-    """How many markers of the scene must be found without a prior."""
+    """Number of markers of the scene that must be found without a prior."""
 
     def make_detector(self, context: DriverContext) -> Detector:
         """A new detector."""
         raise NotImplementedError("override make_detector(context)")
 
     def make_scene(self) -> tuple[np.ndarray, dict[int, tuple[float, float]]]:
-        """An image (height, width) uint8 with markers in it, and where they are: id -> (u, v) [px]."""
+        """An image (height, width) uint8 with markers in it, and their positions: id -> (u, v) [px]."""
         raise NotImplementedError("override make_scene()")
 
     def make_context(self, tmp_path: Path) -> DriverContext:

@@ -1,5 +1,5 @@
-"""Episodes of LeRobot data sets, played back: their times, which cameras and joints share, and the joint driver
-``lerobot``. The cameras are the driver ``video``'s.
+"""Playback of episodes of LeRobot data sets: their times, common to cameras and joints, and the joint driver
+``lerobot``. The cameras use the driver ``video``.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from stereoservo_drivers.options import decode_options
 DRIVER = "lerobot"
 EpisodeNumber = Annotated[int, Meta(ge=0, le=lerobot.MOST_COUNTED)]
 SLOWEST_HZ, FASTEST_HZ = 0.1, 1000.0
-"""Rates of data sets that are played back, as of any camera."""
+"""Range of rates of data sets that are played back, as for any camera."""
 AROUND = {"revolute": 0.2, "prismatic": 0.05}
-"""By which a joint's range is wider than what the episode spans [rad or m]."""
+"""Margin of a joint's limits beyond the range of the episode [rad or m]."""
 LEAST_VELOCITY = 0.1
-"""Of a joint that stands through the episode [rad/s or m/s]."""
+"""Velocity limit of a joint that does not move in the episode [rad/s or m/s]."""
 
 
 @contextmanager
 def refused(what: str) -> Iterator[None]:
-    """Boundary around the reader of ``what``: its refusals, and a missing extra, as DriverError."""
+    """Context manager around the reader of ``what``: raises its errors, and a missing extra, as DriverError."""
     try:
         yield
     except lerobot.DataSetError as error:
@@ -52,10 +52,10 @@ def refused(what: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Episode:
-    """An episode's ``rows``, their ``stamps_ns`` (r,) from 0 on, and the ``period_ns`` after which it begins again.
+    """An episode's ``rows``, their ``stamps_ns`` (r,) from 0 on, and the ``period_ns`` after which it restarts.
 
-    Played again and again it begins at each whole multiple of its period on the monotonic clock: so cameras and joints
-    in processes of their own play it at the same times, and go on there after a restart.
+    In repeated playback it restarts at each whole multiple of its period on the monotonic clock: cameras and joints in
+    separate processes play it at the same times, and continue there after a restart.
     """
 
     info: lerobot.Info
@@ -78,9 +78,11 @@ def episode_of(folder: Path, number: int) -> Episode:
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of joints that are played back. ``dataset``: the folder of a LeRobot data set, looked for in the
-    directory of the cell file; ``episode``: its number. ``units``: of its states, such as ``deg,gripper.pos=none``.
-    ``rate_hz``: of the samples; between the data set's own, positions are interpolated.
+    """Options of joints that are played back.
+
+    ``dataset``: the folder of a LeRobot data set, relative to the cell file's directory; ``episode``: its number.
+    ``units``: of its states, such as ``deg,gripper.pos=none``.
+    ``rate_hz``: of the samples; positions are interpolated between those of the data set.
     """
 
     dataset: str
@@ -90,7 +92,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
 
 
 class EpisodeJointDriver:
-    """Joints of an episode, played back again and again. They are only read: :meth:`activate` refuses."""
+    """Joints of an episode in repeated playback. They are read-only: :meth:`activate` refuses."""
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
         self._options = decode_options(EpisodeOptions, options, DRIVER)
@@ -106,7 +108,7 @@ class EpisodeJointDriver:
         self._positions: FloatArray = self._episode.rows.state[:, columns] * scales
 
     def describe(self) -> JointDriverDescription:
-        """The joints; their limits are what the episode spans and a little more. Works unconnected."""
+        """The joints; their limits are the range of the episode plus a margin. Works unconnected."""
         positions, stamps_s = self._positions, self._episode.stamps_ns * 1e-9
         fastest = np.full(len(self._names), LEAST_VELOCITY)
         if len(stamps_s) > 1:
@@ -129,7 +131,7 @@ class EpisodeJointDriver:
         )
 
     def configure(self) -> None:
-        """Begin to tell positions. Raises DriverError."""
+        """Start to provide positions. Raises DriverError."""
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         self._life.state = LifecycleState.CONFIGURED
 
@@ -173,5 +175,5 @@ class EpisodeJointDriver:
         """No effect: never active."""
 
     def close(self) -> None:
-        """No samples from now on. Idempotent; never raises."""
+        """Stop to provide positions. Idempotent; never raises."""
         self._life.state = LifecycleState.CLOSED

@@ -29,19 +29,22 @@ Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 Count = Annotated[int, Meta(ge=1)]
 SHUTTER_ROUNDS = 3
-"""In which the row that shows a marker of a moving arm is found."""
+"""Row of the image assumed to show a marker of a moving arm."""
 
 
 class Faults(msgspec.Struct, forbid_unknown_fields=True, kw_only=True):
     """Injected faults of a fake arm; may be changed while it runs (``driver.faults``).
 
-    Each call counts from 1 over the driver's life. ``fail_write``, ``fail_read``: that call and later
-    ones raise DriverError (``connection_lost``). ``fail_activate``: activate() raises.
+    Each call counts from 1 over the driver's life.
+    ``fail_write``, ``fail_read``: that call and later ones raise DriverError (``connection_lost``).
+    ``fail_activate``: activate() raises.
     ``freeze_encoder_after``: from that read on positions, velocities and stamp are frozen (no feedback).
-    ``stuck_encoder_after``: positions are frozen, the stamp continues. ``drop_writes_after``: later
-    commands do not reach the drives, though reported as sent. ``delay_s``: states are that old. ``gain``:
-    the drives run at this multiple of the command. ``block_after``: from that write on something is in the way of
-    the joint ``block_joint`` (empty: of the one that is then fastest), where it stands, in the direction it moves in.
+    ``stuck_encoder_after``: positions are frozen, the stamp continues.
+    ``drop_writes_after``: later commands do not reach the drives, though reported as sent.
+    ``delay_s``: age of the states.
+    ``gain``: the drives run at this multiple of the command.
+    ``block_after``: from that write on an obstacle blocks the joint ``block_joint`` (empty: the one that is then
+    fastest) at its position, in its direction of motion.
     """
 
     fail_write: Count | None = None
@@ -160,7 +163,7 @@ class FakeJointDriver(SimulatedArm):
         return super().send(bank, now_ns, asked)
 
     def _block(self, asked: FloatArray) -> None:
-        """Block a joint by a wall, once it moves."""
+        """Block a joint by an obstacle, once it moves."""
         assert self._plant is not None  # configured: the lifecycle was checked
         named = [k for k, joint in enumerate(self._joints) if joint.name == self.faults.block_joint]
         joint = named[0] if named else int(np.abs(asked).argmax())
@@ -177,8 +180,8 @@ class FakeJointDriver(SimulatedArm):
 
 
 class FakeCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of a fake camera. ``noise_px``: sigma of each coordinate; ``marker_drop_rate``: chance to
-    miss a marker.
+    """Options of a fake camera. ``noise_px``: sigma of each coordinate; ``marker_drop_rate``: probability of missing a
+    marker.
     """
 
     noise_px: NonNegative = 0.05
@@ -207,7 +210,7 @@ class FakeCameraDriver(SimulatedCamera):
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator
     ) -> CameraObservation:
-        """The markers that this camera sees with the ``arm`` where it is."""
+        """The markers that this camera sees for the current pose of the ``arm``."""
         q, camera = arm.middle, self.camera.focused(self.focus)
         pixels, seen = self._without_noise(camera, q)
         if arm.moves:
@@ -220,7 +223,7 @@ class FakeCameraDriver(SimulatedCamera):
             beside, _ = self.cell.in_world(camera, q).image_of(part.marker_positions(pose))
             pixels, ids = np.concatenate([pixels, beside]), np.append(ids, part.body.ids)
             seen = np.append(seen, self.cell.workpiece_visible(q, pose, camera))
-        # The same numbers are drawn whatever is seen: one marker's fate does not change another's noise.
+        # The same numbers are drawn for any visibility: one marker's visibility does not change another's noise.
         noise = rng.standard_normal(pixels.shape) * self._fake.noise_px
         seen &= rng.random(len(seen)) >= self._fake.marker_drop_rate
         k = int(np.count_nonzero(seen))
@@ -236,7 +239,7 @@ class FakeCameraDriver(SimulatedCamera):
         )
 
     def _without_noise(self, camera: PinholeCamera, q: FloatArray) -> tuple[FloatArray, BoolArray]:
-        """Pixels (k, 2) of the body's markers, and which of them are seen (k,): of an arm at rest those of before."""
+        """Pixels (k, 2) of the body's markers, and which of them are seen (k,); cached for an arm at rest."""
         view = (q.tobytes(), self.camera, self.focus, self.cell)
         if not self._view or self._view[:4] != view:
             self._view = (*view, self._image_of(camera, q), self.cell.visible(q, camera))

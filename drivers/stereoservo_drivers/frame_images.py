@@ -8,7 +8,7 @@ from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports.devices import DriverError, Frame
 
 SMALLEST_IMAGE = 32
-"""Of a side [px]."""
+"""Least side of an image [px]."""
 
 
 def gray_image(frame: Frame, camera: str) -> ImageArray:
@@ -26,7 +26,7 @@ def gray_image(frame: Frame, camera: str) -> ImageArray:
 
 
 def sized_image(frame: Frame, camera: str, size: tuple[int, int] | None) -> ImageArray:
-    """The frame's image of ``size`` (width, height) [px], of any from SMALLEST_IMAGE a side where it is None.
+    """The frame's image of ``size`` (width, height) [px], or with sides of at least SMALLEST_IMAGE if it is None.
 
     Raises DriverError (``image_format``, ``image_size``).
     """

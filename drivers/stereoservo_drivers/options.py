@@ -1,4 +1,4 @@
-"""Strict decoding of driver options from a cell file; errors state key, value and what would be valid."""
+"""Strict decoding of driver options from a cell file; errors state key, value and valid values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
     """Decode ``options`` as ``kind``, a struct that forbids unknown fields.
 
     Raises:
-        DriverError: code ``option``; names the driver, the option, its value and what would have been valid.
+        DriverError: code ``option``; names the driver, the option, its value and the valid values.
     """
     try:
         return msgspec.convert(dict(options), kind, strict=True)
@@ -38,7 +38,7 @@ def decode_options(kind: type[T], options: Mapping[str, Any], driver: str) -> T:
 
 
 def invalid(kind: type[msgspec.Struct], tree: Mapping[str, Any], error: msgspec.ValidationError) -> str:
-    """Error text for ``error`` in ``tree``: key, value, and what would be valid, in a cell file's terms.
+    """Error text for ``error`` in ``tree``: key, value, and valid values, in a cell file's terms.
 
     An element of a list that has a name is identified by it: ``joint 'j3': gear_ratio = 0; valid: a number above 0``.
     """

@@ -1,4 +1,4 @@
-"""Positions to order from joint velocities, for drives that take positions only."""
+"""Position set-points from joint velocities, for drives that accept only positions."""
 
 from __future__ import annotations
 
@@ -7,34 +7,34 @@ import numpy as np
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 LEAD_S = 0.1
-"""Time at the largest velocity that an ordered position may be ahead, where the cell file says nothing."""
+"""Time at the largest velocity by which a set-point may be ahead, if the cell file does not state it."""
 LOAD_OFFSET = {"revolute": 0.06, "prismatic": 0.005}
-"""[rad, m] By which a drive may stand off its ordered position under load, where the cell file says nothing."""
+"""[rad, m] Largest offset of a drive from its set-point under load, if the cell file does not state it."""
 LEARNS_S = 0.2
-"""Time constant in which the offset under load follows what a standing joint shows."""
+"""Time constant of the estimate of the offset under load, from a joint at rest [s]."""
 STANDS_SHARE = 0.02
-"""Of the largest velocity: below it a joint counts as standing."""
+"""Share of the largest velocity below which a joint counts as at rest."""
 LEARNT_SHARE = 0.1
-"""Of the lead: an offset that is known so well counts as learnt."""
+"""Share of the lead: an offset with a smaller uncertainty counts as learnt."""
 LETS_GO_SHARE = 0.25
-"""Of the largest velocity: as fast an order goes back from what blocked its joint."""
+"""Share of the largest velocity at which a set-point returns from an obstacle that blocked its joint."""
 GIVES_WAY_SHARE, GIVES_WAY_AFTER = 0.8, 0.3
-"""Of the way of an order that goes back: a joint that goes along so far carries a load, and nothing blocks it; judged
-after so much of the lead. What blocks a joint, be it soft, takes part of the way.
+"""Share of a returning set-point's travel, evaluated after a share of the lead: a joint that follows it this far
+carries a load, and is not blocked. An obstacle, even a soft one, takes part of the travel.
 """
 _NEARLY = 1.0 - 1e-9
 
 
 class PositionOutput:
-    """Ordered positions of a group of joints (n,) [rad or m].
+    """Position set-points, ``orders``, of a group of joints (n,) [rad or m].
 
-    An order is the integral of the commanded velocities, and is led no farther than ``lead`` (n,) ahead of where the
-    joint stands, offset under load included: a joint whose orders end goes no further than this. The joint never drags
-    its order along, so that one that gives way under load is held. The offset, by which a stiff drive stays behind its
-    order under load, is learnt while the joint stands, up to ``largest_offset`` (n,). A joint whose order has reached
-    the lead is taken for blocked once it stands or is commanded back: its order then goes back to where it stands, with
-    the offset of before. One that gives way meanwhile carries more than was known: it is held, until its load is.
-    ``largest_velocities`` (n,), ``period_s``: of the orders.
+    A set-point is the integral of the commanded velocities, at most ``lead`` (n,) ahead of the joint's position,
+    including the offset under load: without new set-points a joint moves no further than this. The joint's motion never
+    moves its set-point, so that a joint that gives way under load is held. The offset, by which a stiff drive deviates
+    from its set-point under load, is estimated while the joint rests, up to ``largest_offset`` (n,). A joint whose
+    set-point has reached the lead counts as blocked once it rests or is commanded back: its set-point then returns to
+    the joint's position, with the previous offset. A joint that gives way meanwhile carries an unknown load: it is held
+    until that is known. ``largest_velocities`` (n,), ``period_s``: of the set-points.
     """
 
     def __init__(
@@ -59,8 +59,8 @@ class PositionOutput:
         self._back = LETS_GO_SHARE * largest_velocities * period_s
 
     def follow(self, positions: FloatArray, held: BoolArray) -> FloatArray:
-        """Orders of joints at ``positions`` (n,) that are commanded nowhere: they stand where they are; those that are
-        ``held`` (n,) keep the order that they have.
+        """Set-points of joints at ``positions`` (n,) without a commanded motion: their positions; joints that are
+        ``held`` (n,) keep their set-points.
         """
         free = ~held | np.isnan(self.orders)
         self.orders = np.where(free, positions, self.orders)
@@ -74,9 +74,9 @@ class PositionOutput:
         return self.orders
 
     def step(self, velocities: FloatArray, positions: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-        """Orders after one period at ``velocities`` (n,), of joints at ``positions`` (n,).
+        """Set-points after one period at ``velocities`` (n,), of joints at ``positions`` (n,).
 
-        ``low``, ``high`` (n,): limits; a joint beyond one is led no further outward.
+        ``low``, ``high`` (n,): limits; the set-point of a joint beyond one moves no further outward.
         """
         if np.isnan(self.orders).any():
             self.follow(positions, ~np.isnan(self.orders))
@@ -97,8 +97,9 @@ class PositionOutput:
         return self.orders
 
     def _learn_offsets(self, positions: FloatArray, standing: BoolArray, pushes: BoolArray) -> None:
-        """Of joints that stand. What blocks one that ``pushes`` (n,) bears its load, too: its offset is then no farther
-        than ``largest_offset`` from the one that it carried, so that it goes no farther than that when it is freed.
+        """Update the offsets of joints at rest. An obstacle that a joint ``pushes`` (n,) also bears its load: the
+        offset is then limited to ``largest_offset`` from the previous one, and so is the joint's motion when it is
+        freed.
         """
         error = np.where(standing, self.orders - positions - self.offsets, 0.0)
         learnt = self.offsets + self._period_s / LEARNS_S * error
@@ -109,9 +110,9 @@ class PositionOutput:
         self.offsets = np.clip(self.offsets, -self._largest_offset, self._largest_offset)
 
     def _release(self, velocities: FloatArray, positions: FloatArray, standing: BoolArray, moves: BoolArray) -> None:
-        """Let go of what blocks a joint: what a joint that presses stands off its order is no load.
+        """Release obstacles: the offset of a pressing joint from its set-point is not a load.
 
-        Not before its load is known: one that sinks under a new load would be let go, too.
+        Not before its load is known: a joint that sinks under a new load would be released, too.
         """
         sign = np.sign(velocities)
         turned = self._pressed * sign < 0.0
@@ -126,7 +127,7 @@ class PositionOutput:
         learnt = np.abs(stands_off - self.offsets) < LEARNT_SHARE * self._lead
         still = (sign == 0.0) & (self._pressed == 0.0) & (self._lets_go == 0.0)
         rests = ~moves & still & learnt
-        # A reading that flickers hides a standing joint in many a step.
+        # A fluctuating reading hides a joint at rest in many steps.
         self._rested_s = np.where(rests, self._rested_s + self._period_s * standing, 0.0)
         rested = self._rested_s >= LEARNS_S
         self._heavy &= ~rested
@@ -134,7 +135,7 @@ class PositionOutput:
         self._load = np.where(moves, self.offsets, np.where(rested, stands_off, self._load))
 
     def _let_go(self, positions: FloatArray) -> None:
-        """One step back of the orders that let go: to where the joint stands, or until it is seen to carry a load."""
+        """One step of the returning set-points: to the joint's position, or until it is found to carry a load."""
         left = (self.orders - positions - self._load) * self._lets_go
         step = np.where(self._lets_go != 0.0, np.clip(left, 0.0, self._back), 0.0)
         self.orders = self.orders - self._lets_go * step

@@ -1,7 +1,7 @@
 """Drivers of the simulated cell: an arm in the physics engine pybullet, and cameras that render images.
 
-pybullet itself is imported by the arm only, when it is configured: the servo process loads no image code,
-the camera process no physics.
+pybullet itself is imported only by the arm, when it is configured: the servo process loads no image code, the camera
+process no physics.
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ class PybulletJointDriver(SimulatedArm):
 
 class PybulletCameraOptions(CameraOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of a rendering camera. ``noise``: sigma [grey levels]; ``blur``: sigma of the lens [px]; ``lighting``:
-    how the scene's light and the exposure change."""
+    variation of the scene's light and of the exposure.
+    """
 
     noise: NonNegative = 2.0
     blur: NonNegative = 0.7
@@ -94,7 +95,7 @@ class PybulletCameraDriver(SimulatedCamera):
         except Exception as error:
             from stereoservo_sim.world.physics import (
                 PhysicsError,
-            )  # loaded where the background is pybullet's
+            )  # loaded if the background is pybullet's
 
             if isinstance(error, PhysicsError):
                 raise DriverError("physics", str(error)) from error
@@ -103,11 +104,11 @@ class PybulletCameraDriver(SimulatedCamera):
     def deliver(
         self, seq: int, t_shutter_ns: int, t_received_ns: int, arm: ArmByRow, rng: np.random.Generator
     ) -> Frame:
-        """The image with the ``arm`` where it is."""
+        """The image with the ``arm`` at its pose."""
         assert self._renderer is not None  # active: the lifecycle was checked
-        if self._renderer.camera is not self.camera:  # it was bumped
+        if self._renderer.camera is not self.camera:  # the camera was bumped
             self._renderer = self._redraw()
-        self._renderer.cell = self.cell  # what it shows may move
+        self._renderer.cell = self.cell  # its content may move
         return Frame(
             camera=self.name,
             seq=seq,

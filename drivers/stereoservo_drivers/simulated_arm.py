@@ -36,20 +36,25 @@ from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import DriveBank, Plant, PositionBank
 
 RECORD_EVERY_NS = 3_000_000
-"""At least between two samples of the history, so that a plant of 1 kHz does not fill it sooner; cubic between them."""
+"""Least interval between two samples of the history, so that a plant of 1 kHz does not fill it sooner; interpolation is
+cubic.
+"""
 Positive = Annotated[float, Meta(gt=0)]
 NonNegative = Annotated[float, Meta(ge=0)]
 
 
 class ArmOptions(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Options of every simulated arm, beside those on which arm it is and where (`ArmPlace`).
+    """Options of every simulated arm, in addition to the arm and its place (`ArmPlace`).
 
-    ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the
-    simulated cell's base. ``resume``: an arm whose history exists starts at its end. ``encoder``:
-    resolution [rad or m], 0 is exact. ``history``: samples of the truth that are kept. ``mechanics``: a preset, or
-    what is not perfect by joint, see `stereoservo_sim.world.mechanics`; its ``encoder_step`` replaces ``encoder``.
-    ``auxiliary``: joints and outputs beside the arm's, which nothing shows. ``drives``: whether its drives take
-    velocities, or positions (`PositionOutput`) and then watch nobody.
+    ``start``: positions by joint name [rad or m] of an arm that was never moved; joints left out start at the simulated
+    cell's base.
+    ``resume``: an arm with a history starts at its end.
+    ``encoder``: resolution [rad or m], 0 is exact.
+    ``history``: number of stored samples of the true positions.
+    ``mechanics``: a preset, or imperfections by joint, see `stereoservo_sim.world.mechanics`; its ``encoder_step``
+    replaces ``encoder``.
+    ``auxiliary``: joints and outputs besides the arm's, which no camera shows.
+    ``drives``: whether its drives accept velocities, or positions (`PositionOutput`) without a command time-out.
     """
 
     rate_hz: Annotated[float, Meta(ge=10, le=2000)] = 250.0
@@ -66,10 +71,10 @@ class ArmOptions(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=True
 class SimulatedArm:
     """A joint driver over a simulated plant. Time is the context's clock: nothing moves between calls.
 
-    ``read_state`` and ``write_velocity`` bring the simulation up to now, so the truth that cameras see is
-    as fine as these calls are frequent. ``context.services["world"]`` may hold a JointHistory to write
-    to; otherwise it is a file in the runtime directory. ``robot``: whose weight bears on imperfect mechanics; None:
-    it is not known.
+    ``read_state`` and ``write_velocity`` advance the simulation to the current time, so the true positions that cameras
+    see are as fine as these calls are frequent. ``context.services["world"]`` may hold a JointHistory to write to;
+    otherwise it is a file in the runtime directory. ``robot``: its weight loads imperfect mechanics; None: it is
+    unknown.
     """
 
     driver = "simulated"
@@ -118,7 +123,7 @@ class SimulatedArm:
         raise NotImplementedError
 
     def describe(self) -> JointDriverDescription:
-        """Joints, limits, rate; the clock paces."""
+        """Joints, limits, rate; the clock sets the pace."""
         return JointDriverDescription(
             driver=self.driver,
             joints=self._joints,
@@ -133,7 +138,7 @@ class SimulatedArm:
         )
 
     def configure(self) -> None:
-        """Set up the arm at the positions where it was left. Raises DriverError."""
+        """Set up the arm at the positions of its last run. Raises DriverError."""
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         if self._life.state is LifecycleState.CONFIGURED:
             return
@@ -185,16 +190,16 @@ class SimulatedArm:
         return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Order auxiliary joints and outputs. Raises DriverError: not active, no such name, outside its limits."""
+        """Move auxiliary joints and switch outputs. Raises DriverError: not active, unknown name, outside limits."""
         self._life.require("write_auxiliary()", LifecycleState.ACTIVE)
         self._auxiliary.order(values, self._context.clock.now_ns())
 
     def read_auxiliary(self) -> dict[str, float]:
-        """Auxiliary joints and outputs now."""
+        """Current positions of auxiliary joints and states of outputs."""
         return self._auxiliary.values(self._context.clock.now_ns())
 
     def stop_auxiliary(self) -> None:
-        """Auxiliary joints stand where they are."""
+        """Stop auxiliary joints at their positions."""
         self._auxiliary.stop(self._context.clock.now_ns())
 
     def stop(self) -> None:
@@ -207,7 +212,7 @@ class SimulatedArm:
             self._record(self._bank)
 
     def deactivate(self) -> None:
-        """Brake; commands are refused from now on. Idempotent."""
+        """Brake; further commands are refused. Idempotent."""
         if self._life.state is LifecycleState.ACTIVE:
             self.stop()
             self._life.state = LifecycleState.CONFIGURED
@@ -228,7 +233,7 @@ class SimulatedArm:
         return quantised(positions, self._steps)
 
     def send(self, bank: DriveBank, now_ns: int, asked: FloatArray) -> tuple[FloatArray, tuple[str, ...]]:
-        """Send a command to the drives: returns what was sent (n,), and why it differs from what was commanded."""
+        """Send a command to the drives; returns the sent velocities (n,), and why they differ from the command."""
         return bank.command(now_ns, asked)
 
     def _make_bank(self, plant: Plant, now_ns: int) -> DriveBank:
@@ -257,7 +262,7 @@ class SimulatedArm:
         return self._bank
 
     def _stamp(self, bank: DriveBank) -> int:
-        # Several reads inside one simulation step still carry growing stamps.
+        # Several reads inside one simulation step still have increasing stamps.
         self._last_ns = max(bank.t_ns, self._last_ns + 1)
         return self._last_ns
 

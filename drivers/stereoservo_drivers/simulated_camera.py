@@ -43,7 +43,7 @@ class ArmByRow(NamedTuple):
         return not (np.array_equal(self.first, self.middle) and np.array_equal(self.last, self.middle))
 
     def at(self, row: float) -> FloatArray:
-        """Joint positions (n,) when ``row`` was exposed, one outside of the image with the nearest."""
+        """Joint positions (n,) when ``row`` was exposed; for a row outside of the image, those of the nearest one."""
         t = float(np.clip(2.0 * row / (self.height - 1) - 1.0, -1.0, 1.0))
         bend = 0.5 * (self.first + self.last) - self.middle
         return self.middle + 0.5 * t * (self.last - self.first) + t * t * bend
@@ -52,19 +52,24 @@ class ArmByRow(NamedTuple):
 class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of every simulated camera.
 
-    ``view``: which camera of the simulated rig it is (default: the one with the driver's own name). ``k1``: how its
-    lens bends the image, Brown's first coefficient about the principal point; 0 is a pinhole. ``moved``: how far the
-    camera was moved from its place in the rig, in its own frame; ``bumps``: likewise from a moment on, each in place of
-    what was before; so does the file ``simulated-camera-NAME.json`` in the runtime directory. ``workpiece``: there
-    is one beside the body; the file ``simulated-workpiece.json`` there has its pose or motion for every frame
-    (`stereoservo_sim.world.workpiece`), and with cameras on the arm that of the body. ``solid``: the arm holds a solid
-    without markers in place of the marker body, and ``light`` is towards the lamp that shades it, in the world.
-    Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival less
-    ``told_latency_s`` (default: the true one). ``drop_rate``: chance that a frame is lost; ``dropouts``: spans [s, s]
-    after activation without frames; ``freeze_after_s``: from then on the picture stands still though frames keep
-    coming. ``readout_s``: from the exposure of the first row to that of the last, of a rolling shutter; the stamp is
-    the middle row's. ``breathing``: share by which an autofocus swings the focal length to and fro, once in
-    ``breathing_s``. ``seed``: of noise and losses (default: the context's).
+    ``view``: camera of the simulated rig (default: the one with the driver's own name).
+    ``k1``: lens distortion, Brown's first coefficient about the principal point; 0 is a pinhole.
+    ``moved``: displacement of the camera from its place in the rig, in its own frame.
+    ``bumps``: the same from a given time on, each replacing the previous one; so does the file
+    ``simulated-camera-NAME.json`` in the runtime directory.
+    ``workpiece``: there is one beside the body; the file ``simulated-workpiece.json`` there has its pose or motion for
+    every frame (`stereoservo_sim.world.workpiece`), and with cameras on the arm that of the body.
+    ``solid``: the arm holds a solid without markers in place of the marker body; ``light``: direction towards the lamp
+    that shades it, in the world.
+    Shutters open at ``k / rate_hz + phase_s``; a frame arrives ``latency_s`` later, and its stamp is the arrival minus
+    ``told_latency_s`` (default: the true one).
+    ``drop_rate``: probability that a frame is lost.
+    ``dropouts``: spans [s, s] after activation without frames.
+    ``freeze_after_s``: from then on the picture is frozen though frames keep arriving.
+    ``readout_s``: from the exposure of the first row to that of the last, of a rolling shutter; the stamp is the middle
+    row's.
+    ``breathing``: relative oscillation of the focal length by an autofocus, with the period ``breathing_s``.
+    ``seed``: of noise and losses (default: the context's).
     """
 
     view: str = ""
@@ -90,10 +95,9 @@ class CameraOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 class SimulatedCamera:
     """A camera of the simulated cell. It sees the arm at its true pose at the shutter time.
 
-    It is static before the arm, or mounted on it before a static body, by the cell file's ``mount``.
-    ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm
-    has ever moved the camera shows it at the cell's base; when the arm's process is silent, where it was
-    last.
+    It is static in front of the arm, or mounted on it in front of a static body, by the cell file's ``mount``.
+    ``blackout`` may be set while it runs: no frame arrives until it is cleared. Before the simulated arm has ever moved
+    the camera shows it at the cell's base; while the arm's process is silent, at its last position.
     """
 
     driver = "simulated"
@@ -140,7 +144,7 @@ class SimulatedCamera:
         self._workpiece_pose: FloatArray | None = None
         self._target_moved, self._moved_ns = Moved(), 0
         self.focus = 1.0
-        """Focal length over its mean."""
+        """Focal length relative to its mean."""
         self.blackout = False
 
     def deliver(
@@ -160,7 +164,7 @@ class SimulatedCamera:
             self._place = moved
 
     def _stand(self, t_shutter_ns: int) -> None:
-        """Apply the current displacement: by the file, else by the newest bump. Raises DriverError."""
+        """Apply the current displacement: from the file, else from the newest bump. Raises DriverError."""
         since = (t_shutter_ns - self._activated_ns) * 1e-9
         due = [bump for bump in self._options.bumps if bump.at_s <= since]
         given = self._given if not due else Moved(due[-1].shift_m, due[-1].turn_deg)
@@ -170,7 +174,7 @@ class SimulatedCamera:
             raise DriverError("moved", str(error), path=str(self._bumped.path)) from error
 
     def workpiece_pose(self) -> FloatArray | None:
-        """Pose (4, 4) of the workpiece in the world; None where the cell has none."""
+        """Pose (4, 4) of the workpiece in the world; None if the cell has none."""
         return self._workpiece_pose
 
     def describe_as(
@@ -282,8 +286,8 @@ class SimulatedCamera:
         return after is not None and (t_ns - self._activated_ns) * 1e-9 >= after
 
     def _move_target(self, t_ns: int) -> None:
-        """Put what moves by itself, the workpiece or, before cameras on the arm, the body, where it is at ``t_ns``.
-        Raises DriverError.
+        """Set the pose at ``t_ns`` of what moves by itself: the workpiece or, for cameras on the arm, the body. Raises
+        DriverError.
         """
         part, stand = self._cell.workpiece, self._cell.stand
         if (part is None and stand is None) or (self._stands_still(t_ns) and self._moved_ns):

@@ -1,8 +1,8 @@
-"""Driver ``twist``: a simulated arm behind a Cartesian-velocity interface, with a controller of its own.
+"""Driver ``twist``: a simulated arm behind a Cartesian-velocity interface, with its own controller.
 
-The controller solves its inverse kinematics at each call, in velocities, keeps its own speed limits and time-out, and
-stops the arm by itself near a singularity and at a joint's limit, as such controllers do; the cell knows nothing of the
-arm's own joints. A driver of a real one: `kit.cartesian`, docs/extending.md.
+The controller solves its inverse kinematics at each call, in velocities, has its own speed limits and time-out, and
+stops the arm by itself near a singularity and at a joint's limit, as such controllers do; the cell has no access to the
+arm's own joints. For the driver of a real one see `kit.cartesian`, docs/extending.md.
 """
 
 from __future__ import annotations
@@ -38,23 +38,25 @@ Positive = Annotated[float, Meta(gt=0)]
 Triple = tuple[float, float, float]
 
 SINGULAR = 0.01
-"""Smallest over largest singular value of the arm's motion: below it the controller stops."""
+"""Ratio of smallest to largest singular value of the arm's Jacobian below which the controller stops."""
 LIMIT_MARGIN = 0.01
-"""From a joint's limit the controller stops [rad or m]."""
+"""Distance from a joint's limit at which the controller stops [rad or m]."""
 CONTROLLER_US = 1000.0
-"""What the controller's kinematics may take of a call, beside the arm's own."""
+"""Time budget of the controller's kinematics per call, in addition to the arm's own."""
 LONGEST_CYCLE_S = 0.01
-"""Time that the ramp of a twist takes in at most, between two calls."""
+"""Longest time between two calls that the ramp of a twist takes into account."""
 
 
 class TwistOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """Options of the arm behind the interface (`ArmOptions`), and of the interface.
 
-    ``arm``: what moves it. ``tool``: the tool's frame in the flange's. ``frame``: whose axes twists are in.
-    ``attitude``: rotation vector [rad], base from tool, about which turns are counted (default: at the cell's base).
-    ``box``: how far the tool's point may go from there to either side [m]; ``turns`` [rad] about the tool's x, y, z
-    there; ``velocities``, ``accelerations`` of slides and turns. ``speeds``: [m/s], [rad/s] to which the controller
-    itself scales a twist down.
+    ``arm``: the simulated arm.
+    ``tool``: the tool's frame in the flange's.
+    ``frame``: axes of the twists.
+    ``attitude``: rotation vector [rad], base from tool, the zero of turns (default: at the cell's base).
+    ``box``: largest displacement of the tool's point from there to either side [m]; ``turns`` [rad] about the tool's x,
+    y, z there; ``velocities``, ``accelerations`` of slides and turns.
+    ``speeds``: [m/s], [rad/s] to which the controller itself scales a twist down.
     """
 
     arm: Literal["pybullet", "fake"] = "pybullet"
@@ -69,8 +71,8 @@ class TwistOptions(ArmOptions, frozen=True, forbid_unknown_fields=True, kw_only=
 
 
 class _Posture(NamedTuple):
-    """The arm at its joints ``q`` (n,): the tool's pose in its base frame, and its motion's Jacobian (6, n) in the
-    world with that one's singular values and vectors.
+    """The arm at its joints ``q`` (n,): the tool's pose in its base frame, and the Jacobian (6, n) of its motion in the
+    world with its singular values and vectors.
     """
 
     q: FloatArray
@@ -80,7 +82,7 @@ class _Posture(NamedTuple):
 
 
 class SimulatedController:
-    """A :class:`CartesianArm` over a simulated arm. What it tells is the kinematics of its encoders' readings."""
+    """A :class:`CartesianArm` over a simulated arm. It reports the forward kinematics of its encoders' readings."""
 
     def __init__(self, options: TwistOptions, inner: SimulatedArm, robot: Robot, context: DriverContext) -> None:
         self._inner, self._robot, self._clock = inner, robot, context.clock
@@ -91,7 +93,7 @@ class SimulatedController:
         self._twist, self._at = (
             np.zeros(6),
             np.zeros(6),
-        )  # commanded, and where its ramp is; turns times LEVER
+        )  # commanded twist, and current state of its ramp; turns times LEVER
         self._deadline_ns = self._driven_ns = 0
         self._stopped = ""
         self._here: _Posture | None = None
@@ -99,7 +101,7 @@ class SimulatedController:
         self._low, self._high, self._fastest = np.array(ends).T
 
     def connect(self) -> None:
-        """Set up the arm; a protective stop is over."""
+        """Set up the arm; clears a protective stop."""
         self._inner.configure()
         self._twist[:] = self._at[:] = 0.0
         self._stopped = ""
@@ -109,14 +111,14 @@ class SimulatedController:
         self._inner.activate()
 
     def read(self) -> CartesianState:
-        """Pose and twist of the tool's point. Raises DriverError (``protective_stop``) where the controller stopped."""
+        """Pose and twist of the tool's point. Raises DriverError (``protective_stop``) if the controller stopped."""
         state = self._inner.read_state()
         if self._stopped:
             raise DriverError("protective_stop", self._stopped)
         here = self._posture(state.positions)
         self._drive(here)
         told = here.J @ state.velocities
-        R = self._robot.mounted[:3, :3].T  # the robot tells everything in its own base frame
+        R = self._robot.mounted[:3, :3].T  # the robot reports everything in its own base frame
         return CartesianState(state.t_ns, here.pose, R @ told[:3], R @ told[3:] / LEVER)
 
     def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -153,7 +155,7 @@ class SimulatedController:
         self._inner.close()
 
     def _posture(self, q: FloatArray) -> _Posture:
-        """The arm at its joints ``q`` (n,); computed once, for several calls of a cycle ask for it."""
+        """The arm at its joints ``q`` (n,); computed once, because several calls of a cycle need it."""
         if self._here is None or not np.array_equal(q, self._here.q):
             pose = tool_pose(self._robot, self._tool, q)
             J = body_jacobian(self._robot, q, (self._robot.mounted @ pose)[:3, 3])
@@ -162,8 +164,8 @@ class SimulatedController:
         return self._here
 
     def _drive(self, here: _Posture) -> float:
-        """One cycle: the arm's joint velocities for the twist in force, or a stop of its own. Returns the share of the
-        twist that the arm's joints are fast enough for.
+        """One cycle: the arm's joint velocities for the current twist, or a stop by the controller. Returns the share
+        of the twist that the arm's joint velocities allow.
         """
         now_ns = self._clock.now_ns()
         if now_ns >= self._deadline_ns:
@@ -189,7 +191,7 @@ class SimulatedController:
         return share
 
     def _ramp(self, dt: float) -> None:
-        """Bring the twist in force nearer to the commanded one, slide and turn each at its acceleration."""
+        """Move the current twist towards the commanded one, slide and turn each at its acceleration."""
         for part, acceleration in (
             (slice(3), self._accelerations[0]),
             (slice(3, 6), LEVER * self._accelerations[1]),
@@ -207,7 +209,7 @@ class SimulatedController:
 
 
 class TwistJointDriver(CartesianJointDriver):
-    """The simulated arm as its Cartesian interface shows it: six virtual joints."""
+    """The simulated arm through its Cartesian interface: six virtual joints."""
 
     driver = "twist"
 
@@ -233,15 +235,15 @@ class TwistJointDriver(CartesianJointDriver):
         super().__init__(SimulatedController(decoded, inner, cell.robot, context), description, attitude, decoded.frame)
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Order auxiliary joints and outputs, as `SimulatedArm`."""
+        """Move auxiliary joints and switch outputs, as `SimulatedArm`."""
         self._inner.write_auxiliary(values)
 
     def read_auxiliary(self) -> dict[str, float]:
-        """Auxiliary joints and outputs now."""
+        """Current positions of auxiliary joints and states of outputs."""
         return self._inner.read_auxiliary()
 
     def stop_auxiliary(self) -> None:
-        """Auxiliary joints stand where they are."""
+        """Stop auxiliary joints at their positions."""
         self._inner.stop_auxiliary()
 
 
@@ -254,7 +256,7 @@ def tool_pose(robot: Robot, tool: FloatArray, q: FloatArray) -> FloatArray:
 
 
 def attitude_of(options: TwistOptions, cell: SimulatedCell) -> FloatArray:
-    """The attitude (3, 3) about which turns are counted: the option's, else the tool's at the cell's base."""
+    """The attitude (3, 3), zero of the turns: the option's, else the tool's at the cell's base."""
     if options.attitude is not None:
         return turn(np.array(options.attitude))
     return tool_pose(cell.robot, options.tool.matrix, cell.base)[:3, :3]
@@ -273,7 +275,7 @@ def limits_of(options: TwistOptions, cell: SimulatedCell) -> VirtualLimits:
 
 
 def seen_as_joints(options: Mapping[str, Any], cell: SimulatedCell) -> SimulatedCell:
-    """The truth of a cell of driver ``twist`` with the virtual joints in place of the arm's. Raises DriverError."""
+    """The true arm of a cell of driver ``twist`` with the virtual joints in place of the arm's. Raises DriverError."""
     decoded = decode_options(TwistOptions, options, TwistJointDriver.driver)
     return virtual_cell(
         cell,

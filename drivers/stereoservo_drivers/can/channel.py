@@ -1,4 +1,4 @@
-"""CAN channel over any python-can interface; its failures become typed errors with what to check."""
+"""CAN channel over any python-can interface; its failures are raised as typed errors with remedies."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from stereoservo_drivers.can.slcan_lines import flags_in_words
 
 SEND_TIMEOUT_S = 0.05
 BATCH = 512
-"""Most frames that one ``receive`` gives: a babbling node must not hold the caller for ever."""
+"""Largest number of frames returned by one ``receive``: a babbling node must not block the caller for ever."""
 _KEPT_ERRORS = 256
 NEEDS = {
     "canalystii": "the package canalystii (`pip install canalystii`)",
@@ -45,12 +45,12 @@ NEEDS = {
     "usb2can": "the package pywin32 and 8devices' usb2can library, which are for Windows",
     "vector": "Vector's XL Driver Library, which is for Windows",
 }
-"""Interface of python-can -> what it needs beside python-can."""
+"""Interface of python-can -> what it needs in addition to python-can."""
 _FULL = (errno.ENOBUFS, errno.EAGAIN, errno.ETIMEDOUT)
 
 
 class ChannelOptions(Protocol):
-    """Options to open a channel; ``CanOptions`` contains them, too."""
+    """Options to open a channel; part of ``CanOptions``, too."""
 
     @property
     def interface(self) -> str: ...
@@ -66,7 +66,7 @@ class ChannelOptions(Protocol):
 
 
 class ChannelSettings(msgspec.Struct, frozen=True):
-    """The channel options as a struct of their own."""
+    """The channel options as a separate struct."""
 
     interface: str
     channel: str | int
@@ -75,12 +75,12 @@ class ChannelSettings(msgspec.Struct, frozen=True):
 
 
 class Channel:
-    """An open CAN bus; opened by the constructor. One thread receives; others may send meanwhile where the interface
-    is ``stereoservo_slcan`` or ``socketcan``.
+    """An open CAN bus; opened by the constructor. One thread receives; others may send meanwhile if the interface is
+    ``stereoservo_slcan`` or ``socketcan``.
 
-    ``frames_sent``, ``frames_received``: counts. Raises everywhere DriverError with code ``can_open``,
-    ``connection_lost`` (unplugged, peer gone, interface down), ``bus_off``, ``send_timeout`` (nothing is taken any
-    more) or ``send_refused`` (the adapter says no); bus-off is never restarted here.
+    ``frames_sent``, ``frames_received``: counts. Every method raises DriverError with code ``can_open``,
+    ``connection_lost`` (unplugged, peer gone, interface down), ``bus_off``, ``send_timeout`` (no frame is accepted any
+    more) or ``send_refused`` (by the adapter); bus-off is never restarted here.
     """
 
     def __init__(self, options: ChannelOptions, *, send_timeout_s: float = SEND_TIMEOUT_S) -> None:
@@ -97,7 +97,7 @@ class Channel:
         self._fast = self._bus if isinstance(self._bus, SlcanBus) else None
 
     def send(self, frames: list[CanFrame]) -> None:
-        """Send ``frames`` in order, in one write where the interface can."""
+        """Send ``frames`` in order, in one write if the interface supports it."""
         try:
             if self._fast is not None:
                 self._fast.send_many(frames, self._send_timeout_s)
@@ -111,7 +111,7 @@ class Channel:
     def receive(self, timeout_s: float) -> list[tuple[int, CanFrame]]:
         """All waiting frames (at most ``BATCH``), stamped [ns, monotonic] as read; blocks until the first one.
 
-        What controller and line report beside frames is kept for ``take_errors``; bus-off raises.
+        Errors reported by controller and line are stored for ``take_errors``; bus-off raises.
         """
         try:
             received = self._receive_fast(timeout_s) if self._fast is not None else self._receive(timeout_s)
@@ -184,7 +184,7 @@ class Channel:
                 ignore_config=True,
                 **dict(options.interface_options),
             )
-        except Exception as error:  # interfaces of others, without their maker's library, raise anything
+        except Exception as error:  # other interfaces, without the vendor's library, may raise any exception
             raise self._not_opened(error) from error
         if options.interface == "socketcan":
             enlarge_receive_buffer(bus)
@@ -287,7 +287,7 @@ class Channel:
 
 
 def _errno(error: BaseException | None) -> int | None:
-    """The system's error number, searched in an error's causes, too."""
+    """The system's error number, also searched in an error's causes."""
     while error is not None:
         number = getattr(error, "errno", None)
         if number is None:
@@ -299,7 +299,7 @@ def _errno(error: BaseException | None) -> int | None:
 
 
 def _wrong(error: BaseException) -> bool:
-    """Whether the configuration is at fault, and not the hardware."""
+    """Whether the configuration is the cause, and not the hardware."""
     return isinstance(error, (TypeError, ValueError, ImportError, can.CanInterfaceNotImplementedError))
 
 
@@ -342,7 +342,7 @@ class BusError(msgspec.Struct, frozen=True):
 
 
 def bus_error(message: can.Message) -> BusError:
-    """Decode an error frame; the most severe error where it reports several."""
+    """Decode an error frame; returns the most severe error if it reports several."""
     number, data = message.arbitration_id, bytes(message.data)
     for bit, code, words in _CLASSES[:1]:
         if number & bit:
@@ -368,7 +368,7 @@ def _counters(data: bytes) -> str:
 
 
 RECEIVE_BUFFER = 1 << 20
-"""[bytes] of the socket; the default holds some 300 frames, the kernel drops what comes beyond (python-can #657)."""
+"""[bytes] of the socket; the default holds some 300 frames, and the kernel drops further ones (python-can #657)."""
 _SO_RCVBUFFORCE = 33
 
 
@@ -384,7 +384,7 @@ class SocketcanState(msgspec.Struct, frozen=True):
 
 
 def read_state(channel: str) -> SocketcanState | None:
-    """State of ``channel``; None where `ip` is missing or does not know the interface."""
+    """State of ``channel``; None if `ip` is missing or does not have the interface."""
     command = shutil.which("ip") or shutil.which("ip", path="/usr/sbin:/sbin")
     if command is None:
         return None
@@ -416,7 +416,7 @@ def state_of(link: dict[str, Any]) -> SocketcanState:
 
 
 def objection(state: SocketcanState, channel: str, bitrate: int) -> str | None:
-    """Text: why ``channel`` cannot be used at ``bitrate`` [bit/s], with the remedy; None where it can."""
+    """Text on why ``channel`` cannot be used at ``bitrate`` [bit/s], with the remedy; None if it can."""
     if state.kind not in ("can", "vcan", "vxcan", "slcan"):
         return f"it is a network interface of kind {state.kind or 'unknown'!r}, not of CAN"
     remedy = f"ip link set {channel} down; ip link set {channel} up type can bitrate {bitrate} restart-ms 0"
@@ -437,6 +437,6 @@ def enlarge_receive_buffer(bus: can.BusABC) -> int:
     try:
         channel.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, RECEIVE_BUFFER)
     except PermissionError:
-        # Without CAP_NET_ADMIN, up to net.core.rmem_max.
+        # Without CAP_NET_ADMIN, limited to net.core.rmem_max.
         channel.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER)
     return channel.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)

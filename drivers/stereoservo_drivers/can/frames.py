@@ -6,9 +6,9 @@ import msgspec
 
 
 class CanFrame(msgspec.Struct, frozen=True, gc=False):
-    """A classical CAN data or remote frame. ``id``: 11 bits, or 29 where ``extended``; ``data`` at most 8 bytes.
+    """A classical CAN data or remote frame. ``id``: 11 bits, or 29 if ``extended``; ``data`` at most 8 bytes.
 
-    ``length``: the data length code that a remote frame asks for. Data frames leave it 0: theirs is ``len(data)``.
+    ``length``: data length code that a remote frame requests; 0 for data frames, whose length is ``len(data)``.
     """
 
     id: int

@@ -1,5 +1,5 @@
-"""Bus load: length of CAN frames in bits, and the share of a bus that a cycle takes (ISO 11898-1, classical frames,
-with the intermission of 3 bits after each).
+"""Bus load: length of CAN frames in bits, and the share of a bus that a cycle uses (ISO 11898-1, classical frames, with
+the intermission of 3 bits after each).
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from stereoservo_drivers.can.frames import CanFrame
 CRC_POLYNOMIAL = 0x4599
 """x^15 + x^14 + x^10 + x^8 + x^7 + x^4 + x^3 + 1, without its highest term."""
 TAIL = 13
-"""CRC delimiter, acknowledge slot and delimiter, 7 bits end of frame, 3 bits intermission: none is stuffed."""
+"""CRC delimiter, acknowledge slot and delimiter, 7 bits end of frame, 3 bits intermission: none of them is stuffed."""
 STANDARD_HEAD = 34
-"""Stuffable bits beside the data: start, 11 bits id, remote, IDE, reserved, length, CRC."""
+"""Stuffable bits besides the data: start, 11 bits id, remote, IDE, reserved, length, CRC."""
 EXTENDED_HEAD = 54
 
 
 def crc15(bits: int, count: int) -> int:
     """Checksum of the ``count`` lowest of ``bits``, the highest sent first."""
     table, crc = _crc_table(), 0
-    # Zeros in front change nothing: the register starts with zero.
+    # Leading zeros change nothing: the register starts with zero.
     for byte in bits.to_bytes((count + 7) // 8, "big"):
         crc = (crc << 8 & 0x7FFF) ^ table[crc >> 7 ^ byte]
     return crc
@@ -67,9 +67,7 @@ def worst_bits(length: int, *, extended: bool = False) -> int:
 
 
 class BusLoad(msgspec.Struct, frozen=True):
-    """Worst-case load of a bus. ``cycle_bits``: of all frames of one cycle; ``background``: [bits/s] beside the
-    cycle.
-    """
+    """Worst-case load of a bus. ``cycle_bits``: of all frames of one cycle; ``background``: other traffic [bits/s]."""
 
     cycle_bits: int
     rate_hz: float
@@ -82,7 +80,7 @@ class BusLoad(msgspec.Struct, frozen=True):
         return (self.cycle_bits * self.rate_hz + self.background) / self.bitrate
 
     def rate_at(self, share: float) -> float:
-        """Cycle rate [Hz] at a load of ``share``; 0 where the background alone takes more."""
+        """Cycle rate [Hz] at a load of ``share``; 0 if the background alone exceeds it."""
         return max(share * self.bitrate - self.background, 0.0) / self.cycle_bits
 
     @property
@@ -104,7 +102,7 @@ def cycle_load(
 
 
 def refusal(load: BusLoad, max_share: float) -> str | None:
-    """Text: why ``load`` exceeds ``max_share`` of the bus, and what would fit; None where it does not."""
+    """Text on why ``load`` exceeds ``max_share`` of the bus, and what would fit; None if it does not."""
     if load.share <= max_share:
         return None
     fitting = math.floor(load.rate_at(max_share))
@@ -127,8 +125,8 @@ def _crc_table() -> tuple[int, ...]:
     return tuple(table)
 
 
-# State of the stuffing: 5 * last bit + how many equal ones stand at the end less 1 (so 0 to 4; never 5: the stuff
-# bit is in), _START before the first bit.
+# State of the stuffing: 5 * last bit + number of equal bits at the end - 1 (so 0 to 4; never 5: the stuff bit is
+# included), _START before the first bit.
 _START = 10
 
 
@@ -142,7 +140,7 @@ def _step(state: int, bit: int) -> tuple[int, int]:
 
 @cache
 def _stuffing_tables() -> tuple[tuple[tuple[int, int], ...], ...]:
-    """By state and next byte: stuff bits inserted and the state after it."""
+    """Table by state and next byte: inserted stuff bits, and the state after the byte."""
     return tuple(tuple(_eight_steps(state, byte) for byte in range(256)) for state in range(_START + 1))
 
 

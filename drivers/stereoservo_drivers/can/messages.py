@@ -22,7 +22,7 @@ def from_message(message: can.Message) -> CanFrame:
     """Convert a received ``message`` to a frame.
 
     Raises:
-        ValueError: an error frame or a CAN FD frame, which are no ``CanFrame``.
+        ValueError: an error frame or a CAN FD frame, which are not a ``CanFrame``.
     """
     if message.is_error_frame or message.is_fd:
         kind = "an error frame" if message.is_error_frame else "a CAN FD frame"

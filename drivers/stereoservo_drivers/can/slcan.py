@@ -34,7 +34,7 @@ from stereoservo_drivers.can.slcan_lines import (
 )
 
 GARBLED_LINES = 32
-"""So many malformed lines one after the other are no line noise: the other side speaks something else."""
+"""Number of consecutive malformed lines that are not line noise: the other side uses another protocol."""
 _FRAMES = frozenset(b"tTrR")
 _SENT = frozenset((b"", b"z", b"Z"))
 
@@ -55,8 +55,8 @@ class SlcanBus(can.BusABC):
     """A CAN bus behind a Lawicel-style adapter.
 
     ``channel``: a serial device (``/dev/ttyACM0``, ``/dev/ttyUSB0@1000000``), a pty, or ``socket://HOST:PORT``.
-    ``bitrate``: set on the adapter (None: left as it is). ``send_timeout_s``: how long a full line may hold a send up.
-    ``reply_timeout_s``: how long an answer to a command is awaited; adapters that give none cost it thrice at opening.
+    ``bitrate``: set on the adapter (None: unchanged). ``send_timeout_s``: time limit of a send on a full line.
+    ``reply_timeout_s``: time limit of answers to commands; adapters without answers need it three times at opening.
     One thread may receive while others send. A malformed line is skipped and counted (``malformed``, the last one
     in ``last_malformed``).
 
@@ -120,7 +120,7 @@ class SlcanBus(can.BusABC):
                 raise SlcanRefusedError(f"the adapter refused command {command!r}")
 
     def _await_answer(self, deadline: float) -> bytes | None:
-        """The next answer other than a frame; None where there is none by ``deadline`` of the monotonic clock [s]."""
+        """The next answer other than a frame; None if there is none before ``deadline`` of the monotonic clock [s]."""
         while not self._answers:
             left = deadline - time.monotonic()
             if left <= 0 or not self._fill(left):
@@ -136,7 +136,7 @@ class SlcanBus(can.BusABC):
         limit = self._send_timeout_s if timeout_s is None else timeout_s
         with self._write_lock:
             try:
-                # What a time-out cut off goes first, so that no line is torn.
+                # Send the rest of a line that a time-out cut off first, so that no line is broken.
                 self._unsent = self._port.write(self._unsent + lines, limit)
             except PortLostError as error:
                 raise SlcanLostError(f"{self._port.name}: {error.strerror}", error.errno) from error
@@ -150,7 +150,7 @@ class SlcanBus(can.BusABC):
                 raise can.CanTimeoutError(message)
 
     def _fill(self, timeout_s: float | None) -> bool:
-        """Read once and sort the received lines; False on time-out."""
+        """Read once and sort the received lines; returns False on time-out."""
         try:
             chunk = self._port.read(timeout_s)
         except PortLostError as error:
@@ -201,9 +201,9 @@ class SlcanBus(can.BusABC):
         """Send ``frames`` in one write. ``timeout`` [s] replaces ``send_timeout_s``.
 
         Raises:
-            can.CanTimeoutError: the line takes no more.
+            can.CanTimeoutError: the line accepts no more data.
             can.CanOperationError: the connection is lost (``SlcanLostError``), or an earlier frame was refused
-                (``SlcanRefusedError``); in the latter case these are sent all the same.
+                (``SlcanRefusedError``); in the latter case these are sent nevertheless.
         """
         self._write(b"".join([encode_frame(frame) for frame in frames]), timeout)
         self._check()
@@ -216,7 +216,7 @@ class SlcanBus(can.BusABC):
         return frames
 
     def _await_frame(self, timeout: float | None) -> None:
-        """Read until there is a frame, at most for ``timeout`` [s]."""
+        """Read until a frame arrives, at most for ``timeout`` [s]."""
         self._check()
         deadline = None if timeout is None else time.monotonic() + timeout
         while not self._frames:
@@ -228,7 +228,7 @@ class SlcanBus(can.BusABC):
                 return
 
     def status_flags(self) -> int | None:
-        """The adapter's status by command ``F``, see ``flags_in_words``; None where it does not report it."""
+        """The adapter's status by command ``F``, see ``flags_in_words``; None if it does not report it."""
         self._answers.clear()
         self._write(b"F\r")
         deadline = time.monotonic() + self._reply_timeout_s
@@ -258,15 +258,15 @@ class SlcanBus(can.BusABC):
         return message, False
 
     def fileno(self) -> int:
-        """Descriptor of the port. Frames already read do not make it readable: receive until there is none."""
+        """Descriptor of the port. It is not readable for frames that were already read: receive until there is none."""
         return self._port.fileno()
 
     def shutdown(self) -> None:
-        """Close the adapter's channel and the port; errors are ignored where they are already gone."""
+        """Close the adapter's channel and the port; errors are ignored if they are already closed."""
         if self._is_shutdown:
             return
         super().shutdown()
-        # Unplugged, or the line is full: closing the port is all that is left.
+        # Unplugged, or the line is full: only the port can be closed.
         with contextlib.suppress(can.CanError):
             self._write(b"C\r", 0.05)
         self._port.close()
@@ -298,7 +298,7 @@ class SlcanPort:
         self.name = name
         self._descriptor = descriptor
         self._fd = [descriptor.fileno()]
-        # A terminal's read may be as empty because nothing has come: it is asked before.
+        # An empty read of a terminal may also mean that no data arrived: it was checked before.
         self._tells_its_end = isinstance(descriptor, socket.socket)
 
     def fileno(self) -> int:
@@ -310,7 +310,7 @@ class SlcanPort:
 
         Raises:
             PortLostError: the other side is gone.
-            OSError: anything else that the system says.
+            OSError: any other system error.
         """
         if not (timeout_s == 0 and self._tells_its_end) and not select.select(self._fd, (), (), timeout_s)[0]:
             return b""
@@ -329,7 +329,7 @@ class SlcanPort:
 
         Raises:
             PortLostError: the other side is gone.
-            OSError: anything else that the system says.
+            OSError: any other system error.
         """
         deadline = None
         while content:
@@ -380,7 +380,7 @@ def _connect(channel: str, timeout_s: float) -> SlcanPort:
         )
     connection = socket.create_connection((match["host"].strip("[]"), int(match["port"])), timeout_s)
     connection.setblocking(False)
-    # Without it, Nagle's algorithm and delayed acknowledgement hold small writes back for 40 ms.
+    # Without it, Nagle's algorithm and delayed acknowledgement delay small writes by 40 ms.
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     return SlcanPort(connection, channel)
 

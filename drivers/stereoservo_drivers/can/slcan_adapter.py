@@ -23,8 +23,8 @@ _SHORT, _LONG = b"z\r", b"Z\r"
 class SlcanAdapter:
     """State of one adapter: closed, open, or open for listening; invalid commands are refused with BEL.
 
-    ``bitrate``: what the host has set [bit/s]; None before that, or where it was set by registers (``registers``,
-    BTR0 and BTR1). Whoever owns the bus compares it with the bus. ``flags``: the status that ``F`` answers and clears.
+    ``bitrate``: set by the host [bit/s]; None before, or if it was set by registers (``registers``, BTR0 and BTR1). The
+    owner of the bus compares it with the bus. ``flags``: the status that ``F`` reports and clears.
     """
 
     def __init__(self, *, version: bytes = b"V1013", serial: bytes = b"NSERV") -> None:

@@ -1,7 +1,7 @@
 """Codec of Lawicel's serial-line CAN protocol: frames as text lines, lines from a byte stream. For host and
 adapter.
 
-A line ends with CR; BEL alone says that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
+A line ends with CR; a BEL alone means that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
 (29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits.
 Source: LAWICEL AB, CANUSB manual, "CANUSB ASCII commands".
 """
@@ -17,7 +17,7 @@ from stereoservo_drivers.can.frames import CanFrame
 CR = b"\r"
 BEL = b"\a"
 LONGEST_LINE = 64
-"""Bytes; the longest valid line has 30. What is longer without an end is not a line."""
+"""Maximum length of a line [bytes]; the longest valid one has 30. Longer data without an end is not a line."""
 
 BITRATES = {
     10_000: "S0",
@@ -42,14 +42,14 @@ FLAG_WORDS = (
     "arbitration lost",
     "bus error",
 )
-"""Of the answer to ``F``, from bit 0."""
+"""Meaning of the bits of the answer to ``F``, from bit 0."""
 
 _ID_DIGITS = {ord("t"): 3, ord("r"): 3, ord("T"): 8, ord("R"): 8}
 _REMOTE = {ord("r"), ord("R")}
 
 
 class LineError(ValueError):
-    """Malformed line. ``line``: as received, without its end; ``reason``: what is wrong with it."""
+    """Malformed line. ``line``: as received, without its end; ``reason``: its error."""
 
     def __init__(self, line: bytes, reason: str) -> None:
         super().__init__(f"malformed serial-line CAN {line[:LONGEST_LINE]!r}: {reason}")
@@ -61,7 +61,7 @@ def encode_frame(frame: CanFrame) -> bytes:
     """Encode ``frame`` as a line with its end.
 
     Raises:
-        ValueError: id, data or length that no classical frame has.
+        ValueError: id, data or length is not valid in a classical frame.
     """
     if not (frame.remote or frame.extended):
         return _head(frame.id, len(frame.data)) + hexlify(frame.data).upper() + CR
@@ -92,7 +92,7 @@ def decode_frame(line: bytes) -> CanFrame:
     """Decode a frame from its ``line`` without the end, with or without a time stamp.
 
     Raises:
-        LineError: it is not one.
+        LineError: the line is not a frame.
     """
     return _usual_frame(line) or _any_frame(line)
 
@@ -139,7 +139,7 @@ def bitrate_command(bitrate: int) -> str:
     """Command ``S0`` … ``S8`` of a bit rate.
 
     Raises:
-        ValueError: a bitrate that adapters of this kind cannot be asked for; lists the others.
+        ValueError: a bit rate without a command in this protocol; lists the valid ones.
     """
     if bitrate not in BITRATES:
         valid = ", ".join(f"{known}" for known in BITRATES)
@@ -156,7 +156,7 @@ def flags_in_words(flags: int) -> str:
 class LineSplitter:
     """Splits a byte stream that arrives in chunks into lines.
 
-    What is longer than any line is given as a line as far as it came, so that noise without ends does not pile up.
+    Data longer than any line is returned as a line without waiting for its end, so that noise does not accumulate.
     """
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class LineSplitter:
         if BEL in chunk:
             chunk = chunk.replace(BEL, b"\r\a\r")
             lines = (self._rest + chunk).split(CR)
-            # The CRs put in around BEL are no answers of the adapter.
+            # The CRs inserted around BEL are not answers of the adapter.
             lines = [line for k, line in enumerate(lines) if line or not _beside_bell(lines, k)]
         else:
             lines = (self._rest + chunk).split(CR)

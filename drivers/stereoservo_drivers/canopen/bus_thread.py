@@ -1,7 +1,7 @@
 """The thread that owns the CAN bus: receives, ticks the master on an absolute time grid, sends.
 
-Before the cycle begins, and while faults are reset, it pumps: it receives, hands frames to whoever has subscribed, and
-sends the master's heartbeat. In the cycle heartbeats come from the master's ticks alone: a hung thread is silent.
+Before the cycle starts, and while faults are reset, it receives, passes frames to subscribers, and sends the master's
+heartbeat. During the cycle heartbeats are sent only by the master's ticks: a hung thread is silent.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ PUMP_WAIT_S = 0.002
 HAND_OVER_S = 1.0
 READS_A_PERIOD = 8
 FIRST_READ = 2
-"""Waking for every frame costs more than decoding it, and nothing is decided before the next tick: while answers are
-awaited the thread reads so often, which is also how finely arrivals are told apart; then just before the tick. The
-first of these reads that is worth a wake-up is the ``FIRST_READ``th.
+"""Number of reads per period while answers are awaited; then one just before the tick. Waking for every frame costs
+more than decoding it, and nothing is decided before the next tick. The interval of the reads is also the resolution of
+arrival times. The first read that is worth a wake-up is the ``FIRST_READ``th.
 """
 FOLLOW_EVERY_NS = 500_000_000
 
 
 @dataclass
 class ThreadStatistics:
-    """``skipped``: slots of the grid for which the thread came too late. ``late_max_ns``: of a tick on the grid."""
+    """Statistics. ``skipped``: slots of the grid that the thread missed. ``late_max_ns``: largest delay of a tick."""
 
     skipped: int = 0
     late_max_ns: int = 0
@@ -39,8 +39,8 @@ class ThreadStatistics:
 class BusThread(Subscriptions):
     """The bus thread, a :class:`~stereoservo_drivers.canopen.codec.Link` that can also run the master's cycle.
 
-    It ends by itself when the connection is lost or something unforeseen is raised in it: that fault is latched in the
-    master, the heartbeat ends, and the drives stop by their own monitoring of it. ``error`` holds the cause.
+    It ends by itself when the connection is lost or an unexpected exception is raised in it: that fault is latched in
+    the master, the heartbeat ends, and the drives stop because they monitor it. ``error`` holds the cause.
     """
 
     def __init__(self, channel: Channel, master: Master) -> None:
@@ -131,7 +131,7 @@ class BusThread(Subscriptions):
         self.error = error
 
     def _stop_blindly(self) -> None:
-        """Send quick stop every cycle, without the heartbeat, whose absence stops the drives, too."""
+        """Send quick stop every cycle, without the heartbeat, the absence of which also stops the drives."""
         try:
             while not self._ending:
                 with self._send_lock:
@@ -152,14 +152,14 @@ class BusThread(Subscriptions):
             self._pump(now)
             self._receive(PUMP_WAIT_S)
         elif now >= self._next_ns:
-            if self._master.awaits_answers:  # what came while this thread was off its processor is in time
+            if self._master.awaits_answers:  # frames that arrived while this thread was suspended are in time
                 self._receive(0.0)
             self._tick(time.monotonic_ns())
         else:
             self._sleep_and_read(now)
 
     def _sleep_and_read(self, now: int) -> None:
-        """Wait for the next slot; frames that have arrived when it begins belong to the cycle that ends there."""
+        """Wait for the next slot; frames that have arrived when it starts belong to the cycle that ends there."""
         wake_ns = self._next_ns
         if self._master.awaits_answers:
             wake_ns = min(wake_ns, max(now + self._read_every_ns, self._first_read_ns))
@@ -177,7 +177,7 @@ class BusThread(Subscriptions):
     def _receive(self, timeout_s: float) -> None:
         for t_ns, frame in self._channel.receive(timeout_s):
             self._master.receive(frame, t_ns)
-            if frame.extended:  # 29 bits of another protocol are no identifier of ours
+            if frame.extended:  # 29-bit identifiers belong to another protocol
                 continue
             self.tell(frame)
 
@@ -191,9 +191,9 @@ class BusThread(Subscriptions):
 
 
 def next_slot(slot_ns: int, now_ns: int, period_ns: int) -> tuple[int, int]:
-    """Next slot of the grid to wait for after that of ``slot_ns`` was served at ``now_ns``, and the number skipped.
+    """Next slot of the grid to wait for, after that of ``slot_ns`` was served at ``now_ns``, and the number skipped.
 
-    Slots are never made up for, and the drives get at least half a period to answer before the next poll.
+    Missed slots are never repeated, and the drives have at least half a period to answer before the next poll.
     """
     following = slot_ns + period_ns
     behind = now_ns + period_ns // 2 - following
@@ -202,11 +202,9 @@ def next_slot(slot_ns: int, now_ns: int, period_ns: int) -> tuple[int, int]:
 
 
 def follow_scheduling() -> None:
-    """Give this thread a priority just above the main thread's where that runs in real time; else leave it as it
-    is.
-    """
+    """Give this thread a priority just above the main thread's if that is real-time; else leave it unchanged."""
     process = os.getpid()
-    # The servo process sets this flag beside the policy, and the kernel reports both together.
+    # The servo process sets this flag along with the policy, and the kernel reports both together.
     if os.sched_getscheduler(process) & ~os.SCHED_RESET_ON_FORK != os.SCHED_FIFO:
         return
     above = os.sched_getparam(process).sched_priority + 1
@@ -216,7 +214,7 @@ def follow_scheduling() -> None:
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
     except PermissionError:
-        return  # RLIMIT_RTPRIO allows the main thread's priority and no more: this thread keeps what it has
+        return  # RLIMIT_RTPRIO allows only the main thread's priority: this thread keeps its own
 
 
 def _unforeseen(error: Exception) -> DriverError:

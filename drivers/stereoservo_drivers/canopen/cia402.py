@@ -1,8 +1,8 @@
 """CiA 402 codec for the cyclic master: SYNC, process data, heartbeats and emergencies of servo drives.
 
 RPDO1: control word (0x6040) and set-point, a velocity (0x60FF) or a position (0x607A, 0x60C1), type 255, so that a stop
-needs no SYNC. TPDO1: status word (0x6041) and position (0x6064); TPDO2, TPDO3: the further feedback; all with every
-SYNC. COB-IDs of the predefined connection set (CiA 301).
+needs no SYNC. TPDO1: status word (0x6041) and position (0x6064); TPDO2, TPDO3: the other feedback; all with every SYNC.
+COB-IDs of the predefined connection set (CiA 301).
 """
 
 from __future__ import annotations
@@ -54,13 +54,13 @@ _COMMAND = struct.Struct("<Hi")
 _STATUS_AND_POSITION = struct.Struct("<Hi")
 _ENABLE_OPERATION = int(ControlWord.ENABLE_OPERATION)
 INTERPOLATE = 0x0010
-"""Bit of the control word that makes a drive in interpolated position mode follow its set-points."""
+"""Control word bit with which a drive in interpolated position mode follows its set-points."""
 BIT_S = 0.1
-"""A bit of the status word that says why a drive does not follow must last so long: limits act while it accelerates."""
+"""Minimum duration [s] of a status bit that reports why a drive does not follow: limits act while it accelerates."""
 FOLLOWED_SHARE = 0.5
-"""Of the commanded travel: a joint that goes further while its drive reports a limit does not stand at one."""
+"""Share of the commanded travel: a joint that moves further while its drive reports a limit is not at that limit."""
 LEAST_TRAVEL = 8.0
-"""[counts] Commanded, before a joint's travel is compared with it."""
+"""[counts] Least commanded travel that is compared with the joint's travel."""
 ENABLING = frozenset(ENABLE_STEPS.values())
 _PDO_BYTES = 8
 _CODES_KEPT = 4
@@ -90,9 +90,9 @@ def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
 class DriveAxis:
     """State of one drive. ``codes``: its emergencies since the last error reset, newest last.
 
-    ``enabled``, ``faulty``: by ``state``. ``heard_poll``: number of the poll before its last heartbeat.
-    ``limit_side``: 1 or -1 where the drive's internal limit is known to lie on that side of the joint, else 0.
-    ``switches``: 0x60FD, where it is sent. ``mode``, ``guarded``: as configured.
+    ``enabled``, ``faulty``: from ``state``. ``heard_poll``: number of the poll before its last heartbeat.
+    ``limit_side``: 1 or -1 if the drive's internal limit is known to be on that side of the joint, else 0.
+    ``switches``: 0x60FD, if it is sent. ``mode``, ``guarded``: as configured.
     """
 
     def __init__(self, index: int, joint: CanJoint) -> None:
@@ -130,21 +130,22 @@ class DriveAxis:
 
     @property
     def switch_side(self) -> int:
-        """Side of the joint (1, -1) whose limit switch is active; 0: none, both, or not known."""
+        """Side of the joint (1, -1) with an active limit switch; 0: none, both, or unknown."""
         switches = self.switches or 0
         return self.joint.direction * ((switches >> 1 & 1) - (switches & 1))
 
     def held_at_limit(self, position: float, period_s: float) -> bool:
-        """Whether the drive has limited its motion long enough, and it may be a limit switch or the joint stands.
+        """Whether the drive has limited its motion long enough, and either a limit switch is possible or the joint
+        rests.
 
-        Call it once a cycle while commanding. Limits of current, ramp and velocity are reported by the same bit, in
-        which a healthy drive may be while it accelerates. Only limit switches that are sent tell them apart: where they
-        are not, a joint that goes on may be beyond its switch, with a drive that leaves the braking to its master.
+        Call it once per cycle while commanding. Limits of current, ramp and velocity are reported by the same bit, also
+        for a healthy drive that accelerates. Only limit switches that are sent distinguish them: without these, a joint
+        that continues may be beyond its switch, if its drive leaves the braking to its master.
         """
         if not self.enabled or self.commanded * self._asked < 0.0:
             self._limited_s = self._asked = 0.0
             return False
-        if not self.at_limit:  # it may flicker
+        if not self.at_limit:  # the bit may flicker
             self._limited_s = max(self._limited_s - period_s, 0.0)
             self._asked *= self._limited_s > 0.0
             return False
@@ -160,9 +161,10 @@ class DriveAxis:
         return self.switches is None or moved < FOLLOWED_SHARE * asked
 
     def ignores_set_points(self, period_s: float) -> bool:
-        """Whether the drive, which has followed its set-points since it was enabled, says for long that it does not.
+        """Whether the drive, which has followed its set-points since it was enabled, has long reported that it does
+        not.
 
-        Call it once a cycle while commanding. Bit 12 is another one in profile velocity.
+        Call it once per cycle while commanding. In profile velocity mode bit 12 has another meaning.
         """
         follows = bool((self.status_word or 0) & FOLLOWS_BIT)
         if not self.enabled or self.mode == "pv":
@@ -179,7 +181,7 @@ class DriveAxis:
         self.faulty = self.state in FAULTY
         if not self.at_limit:
             self.limit_side = 0
-        if not self.enabled:  # what it did until now says nothing of the next time
+        if not self.enabled:  # its previous behaviour does not predict the next time
             self._limited_s = self._asked = self._ignored_s = 0.0
             self._followed = False
 
@@ -210,8 +212,8 @@ class DriveAxis:
 class Cia402Codec:
     """Codec of CiA 402 drives.
 
-    Boot-ups, NMT states, heartbeats and emergencies count as faults from ``watch`` to ``ignore``: bring-up itself makes
-    drives boot and complain. States that the newest status words show always count.
+    Boot-ups, NMT states, heartbeats and emergencies count as faults from ``watch`` to ``ignore``: bring-up itself
+    causes boots and emergencies. The states in the newest status words always count.
     """
 
     def __init__(self, options: CanOptions) -> None:
@@ -242,7 +244,9 @@ class Cia402Codec:
         self.arrange([options.feedback] * len(self.axes))
 
     def arrange(self, feedback: list[tuple[str, ...]]) -> None:
-        """Expect ``feedback`` of each drive beside its status word and position; but for switches all send the same."""
+        """Expect ``feedback`` of each drive in addition to its status word and position; all send the same, except
+        switches.
+        """
         count = len(self.axes)
         self.feedback = Feedback(
             positions=np.full(count, np.nan),
@@ -260,7 +264,7 @@ class Cia402Codec:
         self.bit_name = tuple(name for _, name in bits)
 
     def configured(self, axis: DriveAxis, mode: CommandMode, guarded: bool) -> None:
-        """Take over how a drive was configured."""
+        """Store how a drive was configured."""
         axis.mode = mode
         axis.guarded = guarded
         guarded = [CanFrame(HEARTBEAT_ID + a.node_id, remote=True, length=1) for a in self.axes if a.guarded]
@@ -339,7 +343,7 @@ class Cia402Codec:
         return NOT_CYCLIC
 
     def _take_emergency(self, axis: DriveAxis, data: bytes) -> int:
-        if len(data) < 2:  # no error code, and not the error reset that zeros would be
+        if len(data) < 2:  # neither an error code nor the error reset that zeros would be
             return NOT_CYCLIC
         code = int.from_bytes(data[:2], "little")
         axis.take_code(code)
@@ -353,7 +357,7 @@ class Cia402Codec:
         axis.heard_poll = self._polls
         state = data[0] & 0x7F
         if state == NmtState.BOOT_UP and (self._watching or not axis.joint.multi_turn):
-            # What it counts from now on goes on from nothing; but bring-up makes drives boot that count on.
+            # Its new counts start from zero; but drives that bring-up boots continue to count.
             axis.counts.reset()
         if not self._watching or state == NmtState.OPERATIONAL:
             return NOT_CYCLIC
@@ -381,14 +385,12 @@ class Cia402Codec:
         self._watching = True
 
     def ignore(self) -> None:
-        """Stop monitoring: bring-up begins, or the drives are released."""
+        """Stop monitoring: bring-up starts, or the drives are released."""
         self._watching = False
         self._commanding = False
 
     def faults(self) -> tuple[AxisFault, ...]:
-        """Faults since the last call: drives in fault, switched off unrequested, silent, or commanded against a
-        limit.
-        """
+        """Faults since the last call: drives in fault, switched off unrequested, silent, or driven against a limit."""
         if self._commanding:
             for axis in self.axes:
                 self._check_following(axis)
@@ -403,7 +405,7 @@ class Cia402Codec:
         return tuple(events)
 
     def _check_following(self, axis: DriveAxis) -> None:
-        """Note an event where a drive holds its joint back, or ignores what it is told."""
+        """Record an event if a drive limits its joint's motion, or ignores its set-points."""
         position = float(self.feedback.positions[axis.index])
         at_switch = axis.commanded * axis.switch_side > 0.0
         if axis.limit_side == 0 and (axis.held_at_limit(position, self._period_s) or at_switch):
@@ -470,7 +472,7 @@ class Cia402Codec:
         return self._heartbeat
 
     def _stand(self, words: list[ControlWord]) -> list[CanFrame]:
-        """Frames of axes that are commanded nowhere; those that are enabled keep the position that they were led to."""
+        """Frames for axes without a commanded motion; enabled ones keep their last position set-point."""
         self._commanding = False
         held = np.array([axis.enabled and word in ENABLING for axis, word in zip(self.axes, words, strict=True)])
         orders = self._output.follow(self.feedback.positions, held)
@@ -486,8 +488,8 @@ class Cia402Codec:
     def idle(self) -> list[CanFrame]:
         """Frames: disable voltage, target zero.
 
-        0x00 and not 0x06 (shutdown): it leads from every state to switch on disabled, from which only the whole
-        enable sequence leads to power. No fault is reset by it. A moving axis would coast: stop it first.
+        0x00 and not 0x06 (shutdown): from every state it leads to switch on disabled, and from there only the whole
+        enable sequence leads to power. It resets no fault. A moving axis would coast: stop it first.
         """
         return self._stand([ControlWord.DISABLE_VOLTAGE] * len(self.axes))
 
@@ -513,7 +515,7 @@ class Cia402Codec:
 
     @staticmethod
     def _position(axis: DriveAxis, word: ControlWord, order: float, interpolate: bool = False) -> CanFrame:
-        """Frame with a position as set-point; without a known one the drive is not to be enabled."""
+        """Frame with a position as set-point; without a known position the drive must not be enabled."""
         if math.isnan(order):
             return CanFrame(axis.command_id, _COMMAND.pack(min(word, ControlWord.QUICK_STOP), 0))
         counts = wrap_int32(axis.scale.counts(order))
@@ -524,7 +526,7 @@ class Cia402Codec:
         return self._stand([ControlWord.QUICK_STOP] * len(self.axes))
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
-        """Velocities rounded to the drives' units, within 32 bits; as they are where positions are ordered."""
+        """Velocities rounded to the drives' units, within 32 bits; unchanged for position set-points."""
         pairs = zip(self.axes, velocities.tolist(), strict=True)
         return np.array(
             [

@@ -1,7 +1,7 @@
 """Bring-up of CiA 402 drives: presence, identity, configuration, and reset of faults on request.
 
-All of it in NMT state pre-operational, where no process data moves anything and none is awaited. What is written is
-read back. Nothing here enables a drive.
+All of it is done in NMT state pre-operational, in which no process data moves anything and none is awaited. Every
+written value is read back. Nothing here enables a drive.
 """
 
 from __future__ import annotations
@@ -69,18 +69,18 @@ REST_S = 2.0
 """Time for a quick stop of a drive that was found moving."""
 BOOT_S = 3.0
 TAKEN_S = 0.01
-"""Process data that was sent has arrived: an NMT command sent after it must not overtake it."""
+"""Time until sent process data has arrived: a later NMT command must not overtake it."""
 SETTLE_S = 0.03
-"""A cause that is still there trips a drive again within this time."""
+"""Time within which a cause that is still present trips a drive again."""
 STANDS_SHARE = 0.01
-"""Of the largest velocity: slower than this a drive is at rest."""
+"""Share of the largest velocity below which a drive is at rest."""
 LOOK_S = 0.02
-"""Time over which the positions of a drive that reports no velocity tell whether it is at rest."""
+"""Time over which the positions of a drive without velocity feedback show whether it is at rest."""
 
 
 class Cia402Bringup:
     """Bring-up of the drives of one bus. ``identities``, ``setups``: by node id, once connected; ``outputs``,
-    ``grippers``: what is there beside the joints.
+    ``grippers``: devices besides the joints.
     """
 
     def __init__(self, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> None:
@@ -106,7 +106,8 @@ class Cia402Bringup:
         self._ignore()
         with self._drives(link) as drives:
             alone(link, drives)
-            # Whom a master that died has left moving: before anything that can fail, and while they take process data.
+            # Axes that a dead master has left moving: before anything that can fail, and while they accept process
+            # data.
             link.send(self.codec.quick_stop())
             link.wait(TAKEN_S)
             with unbroken(link, drives):
@@ -120,10 +121,9 @@ class Cia402Bringup:
             gripper.watch(link)
 
     def reset(self, link: Link) -> None:
-        """Configure again and clear the faults of all drives, by NMT reset communication where they were bus
-        faults.
+        """Configure again and clear the faults of all drives, by NMT reset communication for bus faults.
 
-        Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` where one cannot be cleared.
+        Ends in switch on disabled. Raises DriverError: as ``connect``; ``fault_stays`` if one cannot be cleared.
         """
         self._ignore()
         with self._drives(link) as drives:
@@ -146,9 +146,9 @@ class Cia402Bringup:
             gripper.watch(link)
 
     def release(self, link: Link) -> None:
-        """Stop process data and the drives' monitoring of this master. Raises one DriverError for all.
+        """End process data and the drives' monitoring of this master. Raises one DriverError for all.
 
-        A drive that is still enabled is stopped and switched off first; one that cannot be keeps its watch.
+        A drive that is still enabled is stopped and switched off first; if that fails, its monitoring remains active.
         """
         self._ignore()
         failed: list[DriverError] = []
@@ -160,7 +160,7 @@ class Cia402Bringup:
                     setup = self.setups.get(drive.node_id)
                     known = setup is not None and setup.capabilities.has(ABORT_OPTION)
                     if known and self._options.abort_option == 1:
-                        drive.write(*ABORT_OPTION, 0)  # leaving operational would make a fault of it
+                        drive.write(*ABORT_OPTION, 0)  # leaving operational would cause a fault
                     drive.nmt("PRE-OPERATIONAL")
                     for write in unwatch_writes(setup) if setup is not None else []:
                         drive.write(write.index, write.subindex, write.value)
@@ -180,7 +180,7 @@ class Cia402Bringup:
 
     @contextmanager
     def _drives(self, link: Link) -> Iterator[list[RemoteDrive]]:
-        # canopen takes long to import: only who talks to drives pays for it
+        # canopen takes long to import: only for access to drives
         from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 
         beside = [(gripper.axis, gripper.eds) for gripper in self.grippers.values()]
@@ -191,7 +191,7 @@ class Cia402Bringup:
             yield [stack.enter_context(RemoteDrive(link, axis, self._dictionaries[eds])) for axis, eds in known]
 
     def _ignore(self) -> None:
-        """What bring-up does to the drives is no fault."""
+        """Context manager in which effects of bring-up on the drives are not faults."""
         self.codec.ignore()
         for gripper in self.grippers.values():
             gripper.ignore()
@@ -201,7 +201,7 @@ class Cia402Bringup:
             drive.nmt("PRE-OPERATIONAL")
 
     def _prepare(self, link: Link, drives: list[RemoteDrive]) -> None:
-        for drive in drives:  # those first that were left moving
+        for drive in drives:  # first those that were left moving
             status_word = drive.read_if_there(0x6041)
             if status_word is not None and drive_state(status_word) is DriveState.OPERATION_ENABLED:
                 drive.write(0x6040, 0, ControlWord.QUICK_STOP)
@@ -223,7 +223,7 @@ class Cia402Bringup:
             self._configure(link, drive, sent)
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
-        """Bring a drive that was left enabled to rest and switch it off. A fault stays as it is."""
+        """Stop a drive that was left enabled, and switch it off. A fault remains."""
         state = _state(drive)
         if state in (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE):
             drive.write(0x6040, 0, ControlWord.QUICK_STOP)
@@ -248,7 +248,7 @@ class Cia402Bringup:
         identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
         unused = unused_pdos(feedback, drive.dictionary)
         off = [write for index in unused for write in self._off(drive, index)]
-        # Without guarding from before: a life time that runs out now would make a fault.
+        # Without guarding from an earlier master: a life time that expires now would cause a fault.
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
         for write in (*first, *identifiers, *off, *parameters):
             drive.write(write.index, write.subindex, write.value, write.option)
@@ -261,7 +261,7 @@ class Cia402Bringup:
         self.outputs.prepare(drive)
 
     def _take_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
-        """Write mode, period and PDOs of a joint's drive; returns what is to be read back. Raises DriverError."""
+        """Write mode, period and PDOs of a joint's drive; returns the writes to read back. Raises DriverError."""
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
         pdos = pdo_writes(self._options, drive.node_id, setup, mode, feedback)
@@ -271,9 +271,9 @@ class Cia402Bringup:
         return [*period, *pdos]
 
     def _write_period(self, drive: RemoteDrive, mode: CommandMode) -> list[Write]:
-        """Write the period of set-points; returns what was written.
+        """Write the period of set-points; returns the writes.
 
-        A drive that is led by velocities may keep another one, which is told as a loss. Raises DriverError where
+        A drive with velocity set-points may keep another period, which is reported as a loss. Raises DriverError if
         positions are interpolated.
         """
         setup = self.setups[drive.node_id]
@@ -296,7 +296,7 @@ class Cia402Bringup:
         return writes
 
     def _choose_mode(self, link: Link, drive: RemoteDrive, setup: Setup) -> CommandMode:
-        """Set the best mode that the drive takes. Raises DriverError (``read_back``) where it takes none."""
+        """Set the best mode that the drive accepts. Raises DriverError (``read_back``) if it accepts none."""
         for mode in setup.modes:
             number = MODES[mode]
             try:
@@ -312,7 +312,7 @@ class Cia402Bringup:
 
     @staticmethod
     def _differs(drive: RemoteDrive, write: Write) -> bool:
-        """Whether a value read back differs; not where the drive lacks the object, whose value is then fixed."""
+        """Whether a value read back differs; False if the drive lacks the object, whose value is then fixed."""
         found = drive.read_if_there(write.index, write.subindex)
         return found is not None and not write.agrees(found)
 
@@ -338,7 +338,7 @@ class Cia402Bringup:
             )
 
     def _start(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Activate the drives' watches of this master, go operational, check that all report so."""
+        """Activate the drives' monitoring of this master, go operational, check that all report so."""
         for drive in drives:
             writes = watch_writes(self._options, self.setups[drive.node_id])
             for write in writes:
@@ -365,7 +365,7 @@ class Cia402Bringup:
     # -- faults ---------------------------------------------------------------------------------------------
 
     def _reset_communication(self, link: Link, drives: list[RemoteDrive]) -> None:
-        """Reset communication by NMT, without which some drives (EPOS4) keep a lost heartbeat or bus as a fault."""
+        """Reset communication by NMT, which some drives (EPOS4) need to clear a lost heartbeat or bus as a fault."""
         with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
             for drive in drives:
                 drive.nmt("RESET COMMUNICATION")
@@ -419,24 +419,24 @@ class Cia402Bringup:
 
 
 def _fixed(drive: RemoteDrive, write: Write) -> bool:
-    """Whether a value that no option asks for cannot be set, by the EDS: the drive's own stays."""
+    """Whether a value that no option requests cannot be set, according to the EDS: the drive's own value remains."""
     variable = drive.variable(write.index, write.subindex)
     return not write.option and variable is not None and not variable.writable
 
 
 def _out_of_range(error: DriverError) -> bool:
-    """Whether a value was refused as none that the object takes, by the drive or by its EDS."""
+    """Whether a value was refused as invalid for the object, by the drive or by its EDS."""
     return error.code == "option" or error.data.get("abort_code") in OUT_OF_RANGE
 
 
 def _state(drive: RemoteDrive) -> DriveState:
-    """Drive state read by SDO; the codec takes it as the newest."""
+    """Drive state read by SDO; the codec stores it as the newest."""
     drive.axis.take_status(drive.read(0x6041))
     return drive.axis.state
 
 
 def _at_rest(link: Link, drive: RemoteDrive) -> bool:
-    """Whether a drive has ended its quick stop: by the velocity that it reports, or by its positions without one."""
+    """Whether a drive has ended its quick stop, from its reported velocity or, without one, from its positions."""
     state, scale = _state(drive), drive.axis.scale
     if state is not DriveState.QUICK_STOP_ACTIVE:
         return state is not DriveState.OPERATION_ENABLED
@@ -479,16 +479,17 @@ DOWNLOAD_OUTPUTS = bytes([0x23, 0xFE, 0x60, 1])
 """Head of an SDO download of four bytes to 0x60FE:1 (CiA 301, 7.2.4.3.3)."""
 DOWNLOADED = 0x60
 OUTPUT_ANSWER_NS = 500_000_000
-"""After which the answer to an order of outputs is taken for lost, and what is ordered is sent again."""
+"""Time [s] after which the answer to an output command counts as lost, and the command is sent again."""
 
 OUTPUTS, OUTPUT_MASK = (0x60FE, 1), (0x60FE, 2)
 
 
 class DigitalOutputs:
-    """Digital outputs of the drives, written without waiting for the drives' answers; ``options``: their cell file's.
+    """Digital outputs of the drives, written without waiting for the drives' answers; ``options``: from the cell file.
 
-    A drive is written one order at a time, for its answer does not say to which it belongs; what is ordered meanwhile
-    follows. ``values``: by name, as the drives have confirmed them. Other bits of 0x60FE stay as they were found.
+    Each drive has one pending command at a time, because an answer does not identify its command; later commands
+    follow.
+    ``values``: by name, as confirmed by the drives. Other bits of 0x60FE keep their initial values.
     """
 
     def __init__(self, outputs: tuple[CanOutput, ...]) -> None:
@@ -522,7 +523,7 @@ class DigitalOutputs:
         self._sent.pop(drive.node_id, None)
 
     def listen(self, link: Link) -> None:
-        """Take the drives' answers on ``link`` from now on."""
+        """Receive the drives' answers on ``link`` from now on."""
         self._link = link
         for node in self._ordered:
             self._answers[node] = []
@@ -539,9 +540,9 @@ class DigitalOutputs:
         self._exchange(link)
 
     def values(self) -> dict[str, float]:
-        """What the drives have confirmed, by name; sends what is still to be sent. Never raises."""
+        """The values confirmed by the drives, by name; also sends pending commands. Never raises."""
         if self._link is not None:
-            with suppress(DriverError):  # a bus that is lost is a fault of its own
+            with suppress(DriverError):  # a lost bus is reported as a separate fault
                 self._exchange(self._link)
         return {
             name: float(self._confirmed.get(output.node_id, 0) >> output.bit & 1)
@@ -549,13 +550,13 @@ class DigitalOutputs:
         }
 
     def _exchange(self, link: Link) -> None:
-        """Take the drives' answers, then send each drive what is due. Raises DriverError."""
+        """Process the drives' answers, then send each drive its pending command. Raises DriverError."""
         now_ns = link.now_ns()
         for node, answers in self._answers.items():
             while answers:
                 self._take(node, answers.pop(0).data)
             if now_ns - self._sent.get(node, (0, now_ns))[1] > OUTPUT_ANSWER_NS:
-                del self._sent[node]  # its answer is lost: whether it was taken is not known
+                del self._sent[node]  # its answer is lost: whether it was executed is unknown
                 self._due.add(node)
         for node in sorted(self._due - self._sent.keys()):
             bits = self._ordered[node]
@@ -564,9 +565,9 @@ class DigitalOutputs:
             self._sent[node] = bits, now_ns
 
     def _take(self, node: int, data: bytes) -> None:
-        """An answer of a drive: to its order, which is confirmed or, where nothing was ordered since, taken back."""
+        """Handle a drive's answer to its command: confirmed or, if no newer command exists, reverted."""
         if node not in self._sent or data[1:4] != DOWNLOAD_OUTPUTS[1:]:
-            return  # to what bring-up has asked
+            return  # answers to requests of bring-up
         bits, _ = self._sent.pop(node)
         if data[0] == DOWNLOADED:
             self._confirmed[node] = bits

@@ -1,7 +1,8 @@
-"""What a CiA 402 drive has, by its own answers, the safest configuration that this allows, and its object writes.
+"""Capabilities of a CiA 402 drive, from its own answers, the safest configuration that they allow, and its object
+writes.
 
-Mandatory in CiA 301 and CiA 402 is little: what a drive does when its master falls silent, its quick stop's reaction
-and the very modes are optional. An EDS may be wrong or of another firmware, so the drive is asked.
+CiA 301 and CiA 402 make few objects mandatory: a drive's reaction to a silent master, its quick stop's reaction and
+even the modes are optional. An EDS may be wrong or of another firmware, so the drive is queried.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 Watch = Literal["heartbeat", "guarding", "deadline"]
 
 MODES: dict[CommandMode, int] = {"csv": 9, "pv": 3, "csp": 8, "ip": 7}
-"""Mode of operation -> its number in 0x6060, the one preferred first."""
+"""Mode of operation -> its number in 0x6060, the preferred one first."""
 TARGETS: dict[CommandMode, tuple[int, int]] = {
     "csv": (0x60FF, 0),
     "pv": (0x60FF, 0),
@@ -55,7 +56,7 @@ LOSSES = {
     QUICK_STOP_OPTION: "0x605A is not there: whether a quick stop ends with the power off is its maker's choice",
     QUICK_STOP_RAMP: "0x6085 is not there: how hard a quick stop brakes is its maker's choice",
 }
-"""What is lost with an object that a drive lacks, for people; of the objects by which it stops."""
+"""Text on the effect of a missing object, for the objects by which a drive stops."""
 NO_SWITCHES = "0x60FD is not there: a limit switch is not told from another limit of the drive"
 NO_WATCH = (
     "the drive watches nothing of this computer that must stop it: it has no consumer heartbeat (0x1016:1) and no node "
@@ -69,8 +70,8 @@ ONLY_DEADLINE = (
 
 @dataclass(frozen=True)
 class Capabilities:
-    """What one drive has. ``values``: of the probed objects that are there; ``modes``: bits of 0x6502, None where
-    it does not tell.
+    """Capabilities of one drive. ``values``: of the probed objects that exist; ``modes``: bits of 0x6502, None if it
+    does not report them.
     """
 
     modes: int | None
@@ -83,7 +84,7 @@ class Capabilities:
 
 @dataclass(frozen=True)
 class Setup:
-    """Configuration of one drive. ``modes``: to try, the best first. ``losses``: what its stops lack, as text."""
+    """Configuration of one drive. ``modes``: to try, the best first. ``losses``: restrictions of its stops, as text."""
 
     capabilities: Capabilities
     modes: tuple[CommandMode, ...]
@@ -91,7 +92,7 @@ class Setup:
     losses: tuple[str, ...] = field(default=())
 
     def safety(self) -> str:
-        """Its watches of this computer, and what is lost, as one line."""
+        """Its monitoring of this computer, and its restrictions, as one line."""
         words = {
             "heartbeat": "this computer's heartbeat (0x1016)",
             "guarding": "node guarding (0x100C)",
@@ -102,7 +103,7 @@ class Setup:
 
 
 def capabilities(drive: RemoteDrive) -> Capabilities:
-    """Ask a drive what it has. Raises DriverError (``sdo_timeout``)."""
+    """Query a drive's capabilities. Raises DriverError (``sdo_timeout``)."""
     found = {key: drive.read_if_there(*key) for key in PROBED}
     return Capabilities(drive.read_if_there(0x6502), {key: value for key, value in found.items() if value is not None})
 
@@ -132,7 +133,7 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
 
 
 def watches_of(options: CanOptions, has: Capabilities) -> tuple[Watch, ...]:
-    """The drive's own watches of this computer, of which heartbeat and guarding exclude each other (CiA 301)."""
+    """The drive's own monitoring of this computer; heartbeat and guarding exclude each other (CiA 301)."""
     watches: list[Watch] = []
     if has.has(HEARTBEAT_CONSUMER):
         watches.append("heartbeat")
@@ -163,13 +164,13 @@ def _modes(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> tuple[
 
 
 def usable(mode: CommandMode, has: Capabilities) -> bool:
-    """Whether a drive has a mode, by 0x6502 where it tells, and the object of its set-point."""
+    """Whether a drive has a mode (by 0x6502 if reported), and the object of its set-point."""
     stated = has.modes is None or bool(has.modes >> (MODES[mode] - 1) & 1)
     return stated and has.has(TARGETS[mode])
 
 
 def available_feedback(options: CanOptions, drives: list[Capabilities]) -> list[tuple[str, ...]]:
-    """Of the feedback asked for, what each drive is to send: switches where it has them, the rest where all have it."""
+    """Requested feedback that each drive is to send: switches if it has them, the rest if all drives have it."""
 
     def sends(drive: Capabilities, what: str) -> bool:
         return all(has.has((FEEDBACK_INDEX[what], 0)) for has in ([drive] if what == "switches" else drives))
@@ -189,13 +190,13 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
 
 
 def periods_agree(options: CanOptions, value: int, exponent: int) -> bool:
-    """Whether a period of set-points as 0x60C2 has it is that of the cycle, within what 0x60C2 can tell."""
+    """Whether a period of set-points read from 0x60C2 is that of the cycle, within the resolution of 0x60C2."""
     due = interpolation_time(options.rate_hz)
     return math.isclose(value * 10.0**exponent, due[0] * 10.0 ** due[1], rel_tol=1e-9)
 
 
 def lead_words(joint: CanJoint) -> str:
-    """How far a drive led by positions goes by itself, as text."""
+    """Maximum motion of a drive with position set-points after its last one, as text."""
     unit = "rad" if joint.kind == "revolute" else "m"
     farthest = joint.lead + joint.largest_load_offset
     return f"led by positions: without orders it goes at most {farthest:.3g} {unit} further"
@@ -223,8 +224,8 @@ _OBJECT = re.compile(r"\s*(0[xX][0-9a-fA-F]{1,4})\s*(?::\s*(\d{1,3}|0[xX][0-9a-f
 
 @dataclass(frozen=True)
 class Write:
-    """One write of ``value`` to an object; read back, it must agree in the bits of ``mask``. ``option``: its origin
-    in the cell file.
+    """One write of ``value`` to an object; read back, it must agree in the bits of ``mask``. ``option``: its origin in
+    the cell file.
     """
 
     index: int
@@ -244,7 +245,7 @@ class Write:
 
 
 def parse_object(name: str, joint: str) -> tuple[int, int]:
-    """Parse ``0x60C2:1`` as index and sub-index (0 where left out). Raises DriverError (``option``)."""
+    """Parse ``0x60C2:1`` as index and sub-index (0 if omitted). Raises DriverError (``option``)."""
     match = _OBJECT.fullmatch(name)
     if match is None or int(match[2] or "0", 0) > 0xFF:
         raise DriverError(
@@ -257,9 +258,7 @@ def parse_object(name: str, joint: str) -> tuple[int, int]:
 
 
 def identifier_writes(node_id: int) -> list[Write]:
-    """Writes of the COB-IDs of SYNC (which the drive must not produce: bit 30) and EMCY, for drives with other
-    values.
-    """
+    """Writes of the COB-IDs of SYNC (not produced by the drive: bit 30) and EMCY, for drives with other values."""
     return [
         Write(0x1005, 0, SYNC_ID, 0x400007FF),
         Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF),
@@ -267,9 +266,9 @@ def identifier_writes(node_id: int) -> list[Write]:
 
 
 def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list[Write]:
-    """Writes of everything but mode, PDOs and the drive's watch of this computer, which is activated last.
+    """Writes of everything but mode, PDOs and the drive's monitoring of this computer, which is activated last.
 
-    Only objects that the drive has. What the joint's ``sdo`` names takes the place of the driver's own value.
+    Only objects that the drive has. Values of the joint's ``sdo`` replace the driver's own.
     """
     scale = JointScale.of(joint)
     limit = scale.rate_units(joint.max_velocity)
@@ -294,7 +293,7 @@ def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list
 
 
 def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: CommandMode) -> list[Write]:
-    """Writes of the period of set-points in the modes that interpolate, where the drive can be told."""
+    """Writes of the period of set-points in the modes that interpolate, if the drive has the object."""
     told = {parse_object(name, joint.name) for name in joint.sdo}
     has = setup.capabilities.values
     if mode == "pv" or INTERPOLATION_TIME not in has or INTERPOLATION_TIME in told:
@@ -312,7 +311,7 @@ def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: Comm
 
 
 def watch_writes(options: CanOptions, setup: Setup) -> list[Write]:
-    """Writes that activate the drive's watch of this computer."""
+    """Writes that activate the drive's monitoring of this computer."""
     if "heartbeat" in setup.watches:
         value = options.master_id << 16 | options.heartbeat_timeout_ms
         return [Write(*HEARTBEAT_CONSUMER, value, option="heartbeat_timeout_ms")]
@@ -326,7 +325,7 @@ def watch_writes(options: CanOptions, setup: Setup) -> list[Write]:
 
 
 def unwatch_writes(setup: Setup) -> list[Write]:
-    """Writes that end the drive's watch of this computer."""
+    """Writes that end the drive's monitoring of this computer."""
     if "heartbeat" in setup.watches:
         return [Write(*HEARTBEAT_CONSUMER, 0)]
     return [Write(*LIFE_FACTOR, 0), Write(*GUARD_TIME, 0)] if "guarding" in setup.watches else []
@@ -366,7 +365,7 @@ def pdo_writes(
 
 
 def unused_pdos(feedback: tuple[str, ...], dictionary: canopen.ObjectDictionary) -> list[int]:
-    """Communication objects of all other PDOs of the EDS: a drive may have them on by default."""
+    """Communication objects of all other PDOs of the EDS: a drive may have them enabled by default."""
     used = len(tpdo_mappings(feedback))
     rpdos = range(RPDO_COMMUNICATION + 1, RPDO_COMMUNICATION + PDO_RANGE)
     tpdos = range(TPDO_COMMUNICATION + used, TPDO_COMMUNICATION + PDO_RANGE)
@@ -393,8 +392,8 @@ def eds_path(options: CanOptions, cell_dir: Path) -> Path:
 
 
 def load_eds(path: Path) -> canopen.ObjectDictionary:
-    """Object dictionary of an EDS file. Raises DriverError (``eds``) where it is invalid."""
-    from canopen import import_od  # heavy: only who talks to drives pays for it
+    """Object dictionary of an EDS file. Raises DriverError (``eds``) if it is invalid."""
+    from canopen import import_od  # slow import: only for access to drives
 
     try:
         dictionary = import_od(str(path))

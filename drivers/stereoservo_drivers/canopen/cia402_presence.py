@@ -19,22 +19,22 @@ if TYPE_CHECKING:
     from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 
 PROBE_S = 0.05
-"""Two nodes of one id both answer within this time."""
+"""Time within which both of two nodes with one id answer [s]."""
 PATIENCE_S = 0.5
-"""A drive may be so slow to answer (CiA 301 sets no limit)."""
+"""Time limit for the answer of a slow drive [s] (CiA 301 sets no limit)."""
 ALONE_S = 0.05
-"""Whoever runs these drives sends them commands within this time."""
+"""Time within which another master of these drives would send them commands [s]."""
 BOOT_UP = b"\0"
 ABORT = b"\x80"
 CIA_402 = 402
 ALL_NODES = range(1, 128)
 IDENTITY = ("vendor_id", "product_code", "revision", "serial_number")
-"""Of 0x1018, subindex 1 to 4; options of a joint are called likewise."""
+"""Names of the sub-indices 1 to 4 of 0x1018, and of a joint's options."""
 
 
 @dataclass(frozen=True)
 class Identity:
-    """Identity object 0x1018 of a drive; None for what it lacks: only the vendor is mandatory (CiA 301)."""
+    """Identity object 0x1018 of a drive; None for missing entries: only the vendor is mandatory (CiA 301)."""
 
     vendor_id: int | None
     product_code: int | None
@@ -64,8 +64,8 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
 
 @contextmanager
 def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
-    """Context manager that raises DriverError (``rebooted``) at its end where a drive has booted meanwhile and lost
-    its configuration.
+    """Context manager that raises DriverError (``rebooted``) at its end if a drive has booted meanwhile and lost its
+    configuration.
     """
     with listening(link, [HEARTBEAT_ID + drive.node_id for drive in drives]) as received:
         try:
@@ -182,7 +182,7 @@ def _number(value: int | None) -> str:
 
 
 def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
-    """Check that an EDS of the drive's own maker is of this drive; the shipped one is of no particular drive."""
+    """Check that an EDS of the drive's own vendor is for this drive; the shipped one is for no particular drive."""
     if eds == SHIPPED_EDS:
         return
     of = drive.dictionary.device_information

@@ -1,7 +1,7 @@
 """SDO access to a drive's object dictionary, with errors as text, and NMT commands.
 
-The protocol is the ``canopen`` package's; frames go and come by the ``Link``, so that no thread of its own receives
-and nothing is swallowed in its callbacks.
+The protocol is implemented by the ``canopen`` package; frames are sent and received by the ``Link``, so that it needs
+no receiving thread and no exception is lost in its callbacks.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ SDO_REQUEST_ID = 0x600
 SDO_RESPONSE_ID = 0x580
 SDO_TIMEOUT_S = 0.5
 LOOK_S = 0.0002
-"""How often an awaited frame is looked for."""
+"""Interval of checks for an awaited frame [s]."""
 
 ABSENT = (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX)
 
@@ -48,11 +48,11 @@ SIZES: dict[tuple[int, int], tuple[int, bool]] = {
     (0x60FD, 0): (4, False), (0x60FE, 1): (4, False), (0x60FE, 2): (4, False), (0x60FF, 0): (4, True),
     (0x6502, 0): (4, False),
 }  # fmt: skip
-"""Bytes and sign of standard objects (CiA 301, CiA 402-2), for drives whose EDS leaves out what they have."""
+"""Sizes [bytes] and signs of standard objects (CiA 301, CiA 402-2), for drives with an EDS that omits them."""
 
 
 class LinkNetwork(canopen.Network):
-    """The ``canopen`` package's network, which sends by a link. It does not receive."""
+    """The ``canopen`` package's network, sending by a link. It does not receive."""
 
     def __init__(self, link: Link) -> None:
         super().__init__()
@@ -118,7 +118,7 @@ class RemoteDrive:
         self._nmt.send_command(NMT_COMMANDS[command])
 
     def variable(self, index: int, subindex: int = 0) -> ODVariable | None:
-        """Entry of the EDS, None where there is none."""
+        """Entry of the EDS, None if there is none."""
         return self.dictionary.get_variable(index, subindex)
 
     def object_name(self, index: int, subindex: int = 0) -> str:
@@ -141,14 +141,14 @@ class RemoteDrive:
         return int.from_bytes(data[:size], "little", signed=signed)
 
     def _layout(self, index: int, subindex: int) -> tuple[int, bool] | None:
-        """Bytes of an object and whether it is signed, by the EDS or the standard; None where neither knows it."""
+        """Size of an object [bytes] and whether it is signed, from the EDS or the standard; None if neither has it."""
         variable = self.variable(index, subindex)
         if variable is not None and variable.fixed_size:
             return len(variable) // 8, variable.data_type in SIGNED_TYPES
         return SIZES.get((index, subindex))
 
     def read_if_there(self, index: int, subindex: int = 0) -> int | None:
-        """Value as by ``read``; None where the drive lacks the object, whatever its EDS says."""
+        """Value as by ``read``; None if the drive lacks the object, whether its EDS has it or not."""
         try:
             return self.read(index, subindex)
         except DriverError as error:

@@ -55,11 +55,11 @@ POWER_OFF = frozenset(
 WARNING_BIT = 0x0080
 INTERNAL_LIMIT_BIT = 0x0800
 FOLLOWS_BIT = 0x1000
-"""Of the cyclic and interpolated modes: the drive follows its set-points."""
+"""Bit of the cyclic and interpolated modes: the drive follows its set-points."""
 
 
 def drive_state(status_word: int) -> DriveState:
-    """State in the status word 0x6041."""
+    """State coded in the status word 0x6041."""
     return _STATES[status_word & 0x7F]
 
 
@@ -206,7 +206,7 @@ ERROR_CODES: dict[int, tuple[str, str]] = {
     0xF004: ("control", _SETTINGS),
     0xFF01: ("manufacturer's error 1", "look 0xFF01 up in the drive's manual"),
 }
-"""Error code of EMCY and 0x603F -> (what it is, what to do); CiA 301 table of emergency codes, CiA 402-1."""
+"""Error code of EMCY and 0x603F -> (meaning, remedy); CiA 301 table of emergency codes, CiA 402-1."""
 
 _ERROR_GROUPS: dict[int, str] = {
     0x1: "generic error",
@@ -248,7 +248,7 @@ ABORT_READ_ONLY = 0x06010002
 ABORT_NO_OBJECT = 0x06020000
 ABORT_NO_SUBINDEX = 0x06090011
 OUT_OF_RANGE = (0x06090030, 0x06090031, 0x06090032)
-"""Codes of values that an object does not take."""
+"""Codes of values that an object does not accept."""
 
 _FIT = "does the EDS fit this drive?"
 _RANGE = "compare the value with the range in the drive's manual"
@@ -290,7 +290,7 @@ ABORT_CODES: dict[int, tuple[str, str]] = {
     0x08000023: ("no object dictionary present", "power the drive off and on"),
     0x08000024: ("no data available", _STATE),
 }
-"""SDO abort code -> (what it is, what to do); CiA 301."""
+"""SDO abort code -> (meaning, remedy); CiA 301."""
 
 
 def abort_words(code: int) -> str:

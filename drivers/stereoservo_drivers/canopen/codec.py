@@ -1,8 +1,8 @@
-"""What a drive protocol consists of: a codec for the cyclic master (frames in, frames out, without clock or I/O) and a
+"""Interfaces of a drive protocol: a codec for the cyclic master (frames in, frames out, without clock or I/O) and a
 bring-up.
 
-Fixed in the master and not in a codec: the rate, freshness of frames, which fault latches, the explicit reset, that a
-stop is repeated every cycle.
+The master, and not a codec, determines the rate, freshness of frames, which fault latches, the explicit reset, and that
+a stop is repeated every cycle.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_drivers.can.frames import CanFrame
 
 NOT_CYCLIC = -1
-"""What ``Codec.receive`` gives for a frame that is not part of the cycle."""
+"""Result of ``Codec.receive`` for a frame that is not part of the cycle."""
 
 
 class AxisFault(msgspec.Struct, frozen=True):
-    """A fault reported or shown by an axis, which must end motion.
+    """A fault reported by an axis, or evident from it, which must end motion.
 
     ``axis``: index of the joint, -1 for the bus. ``code``: stable, e.g. ``drive_fault``, ``emergency``, ``rebooted``,
-    ``mapping``, ``limit_switch``. ``value``: the number on the wire, where there is one. ``hint``: what to do.
+    ``mapping``, ``limit_switch``. ``value``: the number on the wire, if there is one. ``hint``: remedy.
     """
 
     axis: int
@@ -38,8 +38,8 @@ class AxisFault(msgspec.Struct, frozen=True):
 class Feedback(msgspec.Struct, eq=False):
     """Newest feedback of every joint, in joint units, written in place by the codec. NaN before the first frame.
 
-    ``positions`` [rad or m] are unwrapped; ``efforts`` [N m or N where the rated torque is configured, else shares
-    of it]; ``following_errors`` [rad or m]; the last two None where the drives do not send them.
+    ``positions`` [rad or m] are unwrapped; ``efforts`` [N m or N if the rated torque is configured, else shares of it];
+    ``following_errors`` [rad or m]; the last two are None if the drives do not send them.
     """
 
     positions: FloatArray
@@ -49,7 +49,7 @@ class Feedback(msgspec.Struct, eq=False):
 
 
 class Codec(Protocol):
-    """Protocol: codec of one bus of drives, one axis a joint, in joint order.
+    """Protocol: codec of one bus of drives, one axis per joint, in joint order.
 
     ``expected``: bit mask of the cyclic frames that every poll must bring; bit ``b`` belongs to axis ``bit_axis[b]``
     and is called ``bit_name[b]`` ("TPDO1 of node 3").
@@ -65,11 +65,11 @@ class Codec(Protocol):
         ...
 
     def heartbeat(self) -> list[CanFrame]:
-        """Heartbeat frame of the master; empty where the protocol has none."""
+        """Heartbeat frame of the master; empty if the protocol has none."""
         ...
 
     def receive(self, frame: CanFrame) -> int:
-        """Decode a frame into ``feedback``; returns the bit it sets, or NOT_CYCLIC. Faults are kept for ``faults``."""
+        """Decode a frame into ``feedback``; returns the bit it sets, or NOT_CYCLIC. Stores faults for ``faults``."""
         ...
 
     def faults(self) -> tuple[AxisFault, ...]:
@@ -112,12 +112,12 @@ class Codec(Protocol):
 # -- bring-up ------------------------------------------------------------------------------------------------
 # Bring-up protocol of drives: find, check and configure them, clear their faults; routing of received frames.
 #
-# These calls block (tens of milliseconds). While they run, the bus must be served: the driver's receive thread, or a
-# simulation in virtual time.
+# These calls block (tens of milliseconds). While they run, the bus must be served: by the driver's receive thread, or
+# by a simulation in virtual time.
 
 
 class Link(Protocol):
-    """Protocol of a bus that is being served, for use outside of the cycle."""
+    """Interface of a bus that is being served, for use outside of the cycle."""
 
     def send(self, frames: list[CanFrame]) -> None:
         """Send frames in order. Raises DriverError (``connection_lost``)."""
@@ -136,7 +136,7 @@ class Link(Protocol):
         ...
 
     def now_ns(self) -> int:
-        """Time of the link."""
+        """Current time of the link."""
         ...
 
 
@@ -153,7 +153,7 @@ class Bringup(Protocol):
         ...
 
     def reset(self, link: Link) -> None:
-        """Clear latched faults of all drives; check that they are gone. Raises DriverError where one stays."""
+        """Clear latched faults of all drives; check that they are cleared. Raises DriverError if one remains."""
         ...
 
     def release(self, link: Link) -> None:
@@ -186,7 +186,7 @@ class Subscriptions:
 
 @contextmanager
 def listening(link: Link, ids: list[int]) -> Iterator[dict[int, list[CanFrame]]]:
-    """Context manager: frames that arrive meanwhile, by identifier."""
+    """Context manager that collects the frames arriving meanwhile, by identifier."""
     received: dict[int, list[CanFrame]] = {can_id: [] for can_id in ids}
     for can_id, frames in received.items():
         link.subscribe(can_id, frames)

@@ -1,8 +1,8 @@
 """The joint driver ``canopen``: an arm of drives on a CAN bus.
 
-``write_velocity`` stores the newest command, ``read_state`` gives the newest complete set; a thread of its own runs the
-cycle (``bus_thread.py``, ``master.py``) whatever the caller does. A latched fault is raised by ``read_state`` once,
-and by ``write_velocity`` and ``activate`` until ``configure()`` clears it: reset and enable are two acts.
+``write_velocity`` stores the newest command, ``read_state`` returns the newest complete set; a separate thread runs the
+cycle (``bus_thread.py``, ``master.py``) independently of the caller. A latched fault is raised by ``read_state`` once,
+and by ``write_velocity`` and ``activate`` until ``configure()`` clears it: reset and enable are separate steps.
 """
 
 from __future__ import annotations
@@ -47,13 +47,13 @@ CALL_BUDGET_US = 500.0
 FIRST_SAMPLE_S = 1.0
 OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
-"""How long Python lets another thread of the process compute before the bus thread may continue."""
+"""Python's switch interval [s]: another thread of the process may compute this long before the bus thread continues."""
 _POLL_S = 0.001
 _LOADS: dict[Literal["efforts", "following_errors"], str] = {
     "efforts": "effort",
     "following_errors": "following_error",
 }
-"""What ``feedback`` has to name for a sample to carry it."""
+"""Names required in ``feedback`` for a sample to contain the values."""
 
 
 class CanJointDriver:
@@ -75,7 +75,7 @@ class CanJointDriver:
         self._write_seq = 0
 
     def describe(self) -> JointDriverDescription:
-        """Joints and limits of the cell file; the servo's clock paces."""
+        """Description by the cell file's joints and limits; the servo's clock sets the pace."""
         return JointDriverDescription(
             driver=DRIVER,
             joints=tuple(joint.spec() for joint in self.options.joint),
@@ -94,10 +94,10 @@ class CanJointDriver:
     # -- lifecycle ------------------------------------------------------------------------------------------
 
     def configure(self) -> None:
-        """Connect, check and configure all drives; of a configured driver, clear its latched fault. Never enables.
+        """Connect, check and configure all drives; if already configured, clear the latched fault. Never enables.
 
-        A drive that is found in fault does not fail the first call: the fault is latched, and the next call clears it.
-        Raises DriverError.
+        A drive found in fault does not fail the first call: the fault is latched, and the next call clears it. Raises
+        DriverError.
         """
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         if isinstance(self._context.clock, VirtualClock):
@@ -117,20 +117,20 @@ class CanJointDriver:
             self._clear()
 
     def _connect(self) -> None:
-        """Open, bring up, begin the cycle, wait for a complete set. Raises DriverError, with everything closed."""
+        """Open, bring up, start the cycle, wait for a complete set. Raises DriverError, with everything closed."""
         self._release()
         self.bus = BusThread(Channel(self.options), self.master)
         try:
             self.bringup.connect(self.bus)
             self._begin_cycle(self.bus)
-        except BaseException as error:  # nothing else would stop a thread that keeps sending heartbeats
+        except BaseException as error:  # otherwise a thread that keeps sending heartbeats would remain
             self._release()
             code = error.code if isinstance(error, DriverError) else "internal"
             self.master.latch(MasterFault(code, str(error), hint="reset connects again"))
             raise
 
     def _begin_cycle(self, bus: BusThread) -> None:
-        """Begin the cycle and wait for a complete set. Raises DriverError where none comes."""
+        """Start the cycle and wait for a complete set. Raises DriverError if none arrives."""
         self.master.clear()
         self._reported_fault = None
         bus.begin_cycle()
@@ -149,7 +149,7 @@ class CanJointDriver:
             )
 
     def _clear(self) -> None:
-        """Reset the drives' faults. Raises DriverError where a fault stays; it is latched then."""
+        """Reset the drives' faults. Raises DriverError if a fault remains, which is then latched."""
         assert self.bus is not None
         if self.master.fault is None:
             return
@@ -165,7 +165,7 @@ class CanJointDriver:
         self._require_no_fault()
 
     def _await_rest(self) -> None:
-        """Wait for the end of the quick stop before the cycle ends. Raises DriverError where the arm keeps moving."""
+        """Wait for the end of the quick stop before the cycle ends. Raises DriverError if the arm keeps moving."""
         limit_s = self.master.stop_limit_s
         if self._wait(lambda: self.master.stands() is True, limit_s) or self.master.stands() is None:
             return
@@ -195,15 +195,13 @@ class CanJointDriver:
             self.master.request_disable()
             raise DriverError("enable_timeout", f"the CAN bus's thread is stuck in mode {self.master.mode}")
         self._require_no_fault()
-        assert self.bus is not None  # its master runs
+        assert self.bus is not None  # its master is running
         for gripper in self._grippers.values():
             gripper.enable(self.bus.now_ns())
         self._life.state = LifecycleState.ACTIVE
 
     def deactivate(self) -> None:
-        """Bring to rest, then switch off. Idempotent. Raises DriverError where a drive does not report that it is
-        off.
-        """
+        """Bring to rest, then switch off. Idempotent. Raises DriverError if a drive does not report that it is off."""
         if self._life.state is not LifecycleState.ACTIVE:
             return
         self._life.state = LifecycleState.CONFIGURED
@@ -223,7 +221,7 @@ class CanJointDriver:
         return mode is Mode.LATCHED or (mode is Mode.OFF and self._codec.at_rest_unpowered())
 
     def stop(self) -> None:
-        """Command velocity zero from the next cycle on; the drives stay enabled. Any state, never raises."""
+        """Command velocity zero from the next cycle on; the drives remain enabled. Any state, never raises."""
         self.stop_auxiliary()
         self.master.set_command(np.zeros(len(self.options.joint)), time.monotonic_ns())
 
@@ -252,7 +250,7 @@ class CanJointDriver:
     @classmethod
     def find_buses(cls) -> tuple[FoundBus, ...]:
         """CAN adapters and USB serial ports of this computer."""
-        from stereoservo_drivers.canopen.nodes import found_buses  # for `stereoservo setup` alone
+        from stereoservo_drivers.canopen.nodes import found_buses  # only for `stereoservo setup`
 
         return found_buses()
 
@@ -272,7 +270,7 @@ class CanJointDriver:
 
     def examine(self, may_move: MayMove) -> Iterator[ExaminationFinding]:
         """Findings on bus and drives for `stereoservo doctor`; closes the driver."""
-        from stereoservo_drivers.canopen.examination import examine  # for this one command
+        from stereoservo_drivers.canopen.examination import examine  # only for this command
 
         self._life.require("examine()", LifecycleState.CREATED)
         return examine(self, self._context.cell_dir, may_move)
@@ -310,7 +308,7 @@ class CanJointDriver:
         return CommandReport(seq=self._write_seq, t_ns=now_ns, asked=asked, sent=sent, reasons=reasons)
 
     def write_auxiliary(self, values: Mapping[str, float]) -> None:
-        """Order grippers and switch digital outputs. Raises DriverError: not active, a latched fault, no such name, or
+        """Move grippers and switch digital outputs. Raises DriverError: not active, a latched fault, unknown name, or
         outside its limits.
         """
         self._life.require("write_auxiliary()", LifecycleState.ACTIVE)
@@ -324,25 +322,25 @@ class CanJointDriver:
             self.bringup.outputs.write(self.bus, switched)
 
     def read_auxiliary(self) -> dict[str, float]:
-        """Grippers' positions, and digital outputs as the drives have confirmed them."""
+        """Grippers' positions, and digital outputs as confirmed by the drives."""
         outputs = self.bringup.outputs.values() if isinstance(self.bringup, Cia402Bringup) else {}
         return outputs | {name: gripper.position for name, gripper in self._grippers.items()}
 
     def stop_auxiliary(self) -> None:
-        """Grippers stand where they are, powered; digital outputs keep their state."""
+        """Stop grippers at their positions, powered; digital outputs keep their state."""
         for gripper in self._grippers.values():
             if self.bus is not None:
-                with contextlib.suppress(DriverError):  # a bus that is lost is a fault of its own
+                with contextlib.suppress(DriverError):  # a lost bus is reported as a separate fault
                     gripper.stop(self.bus)
 
     def _poll_grippers(self) -> None:
-        """Go on with the grippers' orders; what is wrong with one stops the arm, with its name."""
+        """Continue the grippers' commands; a gripper's fault stops the arm, with its name."""
         if self.bus is None or not self.bus.alive:
             return
         if self.master.fault is not None:
             self.stop_auxiliary()
         for name, gripper in self._grippers.items():
-            with contextlib.suppress(DriverError):  # as above
+            with contextlib.suppress(DriverError):  # see above
                 fault = gripper.poll(self.bus)
                 if fault is not None:
                     told = MasterFault(fault.code, fault.message, axis=name, value=fault.value, hint=fault.hint)
@@ -374,8 +372,8 @@ class CanJointDriver:
 
 
 def _effort_unit(joint: CanJoint, protocol: str) -> str:
-    """Unit of efforts: CiA 402 reports torque in permille of a rated torque (0x6077) that only the cell file may
-    know; ODrive in N m.
+    """Unit of efforts: CiA 402 reports torque in permille of a rated torque (0x6077), which possibly only the cell file
+    states; ODrive in N m.
     """
     if protocol == "cia402" and joint.rated_torque is None:
         return "of rated"
@@ -383,7 +381,7 @@ def _effort_unit(joint: CanJoint, protocol: str) -> str:
 
 
 def make_codec(options: CanOptions) -> Codec:
-    """The cyclic codec. Raises DriverError (``option``) where the options do not fit the protocol."""
+    """The cyclic codec. Raises DriverError (``option``) if the options do not fit the protocol."""
     if options.protocol == "odrive":
         return OdriveCodec(options)
     return Cia402Codec(options)

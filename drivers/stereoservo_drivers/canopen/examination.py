@@ -44,7 +44,7 @@ class ExaminedDriver(JointDriver, Protocol):
 
 
 def examine(driver: ExaminedDriver, cell_dir: Path, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Findings, in the order in which an integrator would check; ends early where no more can be determined."""
+    """Findings, in the order in which an integrator would check; ends early if further ones cannot be determined."""
     options = driver.options
     yield load_finding(options)
     try:
@@ -149,7 +149,7 @@ def _run(driver: ExaminedDriver, may_move: MayMove) -> Iterator[ExaminationFindi
 
 
 def odrive_findings(bringup: OdriveBringup) -> Iterator[ExaminationFinding]:
-    """Findings on what is known of each axis's watchdog, limit and ramp."""
+    """Findings on the known watchdog, limit and ramp of each axis."""
     for axis in bringup.codec.axes:
         well, told = bringup.safety[axis.node_id]
         remedy = "" if well else "name flat_endpoints.json of its release in endpoints; or pull the cable once"
@@ -180,7 +180,7 @@ def _watch(driver: ExaminedDriver) -> Iterator[ExaminationFinding]:
 
 
 def _sample(driver: ExaminedDriver) -> FloatArray:
-    """Current positions; with a latched fault, which is raised once, the sample after it."""
+    """Current positions; with a latched fault, which is raised once, those of the next sample."""
     try:
         return driver.read_state().positions
     except DriverError:
@@ -188,7 +188,7 @@ def _sample(driver: ExaminedDriver) -> FloatArray:
 
 
 def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding:
-    """Finding on cycles that lacked a reply, and slots that this computer missed itself."""
+    """Finding on cycles that lacked a reply, and slots that this computer itself missed."""
     message = f"{cycles} cycles, {missed} without all answers, {skipped} skipped by this computer"
     if missed == 0 and skipped <= MISSED_SHARE * cycles:
         return ExaminationFinding("cycle", True, message)
@@ -257,7 +257,7 @@ def _jog_all(driver: ExaminedDriver, usable: list[bool], may_move: MayMove) -> I
             yield msgspec.structs.replace(found, jogged=(joint.name, trace.travel))
             if found.ok is False:
                 continue
-            name = f"{joint.name} way back"  # else joints that are tried again and again wander off
+            name = f"{joint.name} way back"  # otherwise repeatedly tested joints drift away
             trace, error = _jog(driver, k, -sign * share)
             if error is None:
                 continue
@@ -279,13 +279,13 @@ def _question(joint: CanJoint, sign: float) -> str:
 
 
 def _jog(driver: ExaminedDriver, k: int, share: float) -> tuple[JogTrace, DriverError | None]:
-    """Enable, move joint ``k`` by ``share`` of the usual jog, rest, switch off; returns what ended it early."""
+    """Enable, move joint ``k`` by ``share`` of the usual jog, rest, switch off; returns the reason of an early end."""
     joint = driver.options.joint[k]
     cycle_s = 1.0 / driver.options.rate_hz
     trace = JogTrace(joint, float(driver.read_state().positions[k]), cycle_s)
     try:
         driver.activate()
-        _hold(driver, trace, k, SETTLE_S)  # released brakes let an arm sink a little: that is not the jog
+        _hold(driver, trace, k, SETTLE_S)  # released brakes let an arm sink a little, which is not the jog
         trace = JogTrace(joint, float(driver.read_state().positions[k]), cycle_s)
         _move(driver, trace, k, share)
         if not trace.runs_away():
@@ -314,7 +314,7 @@ def _hold(driver: ExaminedDriver, trace: JogTrace, k: int, seconds: float) -> No
 
 
 def _step(driver: ExaminedDriver, trace: JogTrace, k: int, velocity: float, begun_s: float) -> float:
-    """Command for one period, then read; returns when that was done, at which the next step has ``begun_s``."""
+    """Command for one period, then read; returns the time of that, when the next step starts (``begun_s``)."""
     command = np.zeros(len(driver.options.joint))
     command[k] = velocity
     driver.write_velocity(command)
@@ -331,23 +331,23 @@ def _step(driver: ExaminedDriver, trace: JogTrace, k: int, velocity: float, begu
 
 NOISE_COUNTS = 8.0
 NOISE = 1e-4
-"""[rad or m] An encoder at rest may waver by so much, or by ``NOISE_COUNTS``."""
+"""[rad or m] Largest fluctuation of an encoder at rest, or ``NOISE_COUNTS``."""
 COARSE = 1e-4
-"""[rad/s or m/s] A velocity unit that is larger shows in how a law comes to rest."""
+"""[rad/s or m/s] A coarser velocity unit disturbs how a control law comes to rest."""
 JOG = {"revolute": math.radians(1.0), "prismatic": 2e-3}
-"""How far a joint is jogged [rad or m]."""
+"""Travel of a jog [rad or m]."""
 SLOWEST_SHARE = 5e-3
 FASTEST = {"revolute": 0.04, "prismatic": 0.005}
-"""[rad/s or m/s]"""
+"""[rad/s or m/s] Largest velocity of a jog."""
 DOUBLING_S = 0.06
-"""The jog's velocity doubles in this time: units that are wrong by a thousand show while it still creeps."""
+"""Time in which the jog's velocity doubles [s]: units wrong by a factor of a thousand show while it is still slow."""
 RUNAWAY = 3.0
 TOLERANCE = 0.15
 LAG_S = 0.15
 SURE = 1.3
-"""A named unit within this factor of what would fit is meant."""
+"""A named unit within this factor of the fitting one is assumed to be meant."""
 STOPPED_EARLY = 6.0
-"""The same for a joint that was stopped before it had come up to speed."""
+"""The same for a joint that was stopped before it had reached its speed."""
 NAMED_UNITS = {1.0: "rev/s", 60.0: "rpm", 600.0: "rpm/10", 6000.0: "rpm/100", 60_000.0: "rpm/1000"}
 
 
@@ -408,7 +408,7 @@ def resolution_finding(joint: CanJoint) -> ExaminationFinding:
 def jog_velocity(joint: CanJoint, t_s: float, share: float) -> float | None:
     """Velocity [rad/s or m/s] of the jog at ``t_s`` after its start: slow, doubling, constant; None: finished.
 
-    ``share`` of ``JOG``, with its sign, is how far it goes.
+    ``share``: signed travel as a share of ``JOG``.
     """
     sign = math.copysign(1.0, share)
     fastest = min(FASTEST[joint.kind], 0.2 * joint.max_velocity)
@@ -426,9 +426,9 @@ def jog_velocity(joint: CanJoint, t_s: float, share: float) -> float | None:
 
 @dataclass
 class JogTrace:
-    """Record of a jog, ``add`` every cycle. ``asked``: commanded travel so far [rad or m]; ``unsure``: what of it, and
-    beside it, cycles may account for that took more than twice their ``cycle_s``: drives that hear nothing stop by
-    themselves at some time, or go on.
+    """Record of a jog; call ``add`` every cycle. ``asked``: commanded travel so far [rad or m]; ``unsure``: uncertainty
+    of it from cycles that took more than twice their ``cycle_s``: a drive without commands stops at some time, or
+    continues.
     """
 
     joint: CanJoint
@@ -464,7 +464,7 @@ class JogTrace:
         return abs(self.travel) > RUNAWAY * abs(self.asked) + 3.0 * margin
 
     def in_doubt(self) -> bool:
-        """Whether a drive with right units may have moved so, because cycles took too long."""
+        """Whether a drive with correct units may have moved like this, because cycles took too long."""
         asked, travel = abs(self.asked), math.copysign(1.0, self.asked) * self.travel
         low, high = (1.0 - TOLERANCE) * (asked - self.unsure), (1.0 + TOLERANCE) * (asked + self.unsure)
         apart = abs(self.reported - self.travel)
@@ -472,8 +472,8 @@ class JogTrace:
 
 
 def jog_finding(trace: JogTrace) -> ExaminationFinding:
-    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong; None where this
-    computer stood still for so long that it cannot be told.
+    """Finding on a finished jog: direction, travel, and the factor by which the units are wrong; None if this computer
+    was suspended for so long that they cannot be determined.
     """
     found = _finding_of_units(trace)
     if found.ok is True or not trace.in_doubt():

@@ -1,8 +1,8 @@
-"""A gripper: an auxiliary joint on a CiA 402 drive of its own, which goes to ordered positions by itself (mode 1).
+"""A gripper: an auxiliary joint on its own CiA 402 drive, which moves to commanded positions by itself (mode 1).
 
-RPDO1: target position and control word, in this order, for some drives act on the word as soon as it is there; sent
-only where something is to be done. TPDO1: status word and position, every few SYNCs. It is no part of the arm's cycle:
-that neither waits for it nor counts its frames. What goes wrong with it is a fault that names it.
+RPDO1: target position and control word, in this order, because some drives act on the word as soon as it arrives; sent
+only if needed. TPDO1: status word and position, every few SYNCs. It is not part of the arm's cycle, which neither waits
+for it nor counts its frames. Its faults are reported with its name.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ if TYPE_CHECKING:
 PROFILE_POSITION = 1
 TARGET_POSITION, PROFILE_VELOCITY, TORQUE_LIMIT = (0x607A, 0), (0x6081, 0), (0x6072, 0)
 NEW_SET_POINT, AT_ONCE_BIT, HALT = 0x0010, 0x0020, 0x0100
-"""Of the control word in mode 1: go to the target, without finishing the way to the one before; stand."""
+"""Control word bits in mode 1: new target; without finishing the motion to the previous one; halt."""
 ACKNOWLEDGED = 0x1000
-"""Of the status word in mode 1: the new set-point is taken."""
+"""Status word bit in mode 1: the new set-point is accepted."""
 MODE_S = 0.5
 ENABLE_LIMIT_S, TAKEN_LIMIT_S = 1.5, 0.5
-"""Time to be enabled, and to take an order."""
+"""Time limits of enabling, and of accepting a command [s]."""
 NO_WATCH = (
     "0x1016:1 is not there: where this computer dies the gripper goes on to the position that it was ordered to, and "
     "stays there"
@@ -75,7 +75,7 @@ _POSITION_AND_WORD, _WORD_AND_POSITION = struct.Struct("<iH"), struct.Struct("<H
 class Gripper:
     """One gripper of a cell. ``axis``: its drive's state, ``eds``: of its drive.
 
-    Orders are taken from one thread, and carried out by `poll`, which is called with every cycle.
+    Commands are stored from one thread, and executed by `poll`, which is called in every cycle.
     """
 
     def __init__(self, options: CanOptions, gripper: CanGripper, cell_dir: Path) -> None:
@@ -118,7 +118,7 @@ class Gripper:
         return Setup(has, (), ("heartbeat",), losses)
 
     def parameters(self, setup: Setup) -> list[Write]:
-        """Writes of everything but mode, PDOs and its watch."""
+        """Writes of everything but mode, PDOs and its monitoring of this computer."""
         speed = self.axis.scale.rate_units(self.gripper.velocity)
         writes = [
             *parameter_writes(self._options, self.axis.joint, setup),
@@ -129,7 +129,7 @@ class Gripper:
         return writes
 
     def take_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
-        """Write mode and PDOs; returns what is to be read back. Raises DriverError."""
+        """Write mode and PDOs; returns the writes to read back. Raises DriverError."""
         rpdo, tpdo = (RPDO_COMMUNICATION, RPDO_MAPPING), (TPDO_COMMUNICATION, TPDO_MAPPING)
         node, target = drive.node_id, TARGET_POSITION[0] << 16 | 32
         syncs = syncs_of_gripper(self._options.rate_hz)
@@ -144,7 +144,7 @@ class Gripper:
         return [Write(0x6061, 0, PROFILE_POSITION, option="mode"), *pdos]
 
     def listen(self, link: Link) -> None:
-        """Take the drive's frames on ``link`` from now on."""
+        """Receive the drive's frames on ``link`` from now on."""
         for can_id, frames in (
             (TPDO_IDS[0], self._statuses),
             (HEARTBEAT_ID, self._heartbeats),
@@ -153,7 +153,7 @@ class Gripper:
             link.subscribe(can_id + self.axis.node_id, frames)
 
     def watch(self, link: Link) -> None:
-        """It is configured and operational: from now on its silence and its errors count."""
+        """Start monitoring: it is configured and operational, and its silence and its errors count from now on."""
         for frames in (self._statuses, self._heartbeats, self._emergencies):
             frames.clear()
         self._rest()
@@ -161,7 +161,7 @@ class Gripper:
         self._watching = True
 
     def ignore(self) -> None:
-        """It is about to be configured."""
+        """Stop monitoring, before it is configured."""
         self._watching = False
 
     # -- orders ---------------------------------------------------------------------------------------------
@@ -172,17 +172,17 @@ class Gripper:
         return math.nan if self._position is None else self._position
 
     def enable(self, now_ns: int) -> None:
-        """Power on, standing where it is."""
+        """Switch the power on, holding the current position."""
         if not self._on:
             self._on, self._since_ns = True, now_ns
 
     def order(self, position: float, now_ns: int) -> None:
-        """Go to ``position`` [m or rad]."""
+        """Move to ``position`` [m or rad]."""
         self._order, self._target, self._since_ns = position, position, now_ns
         self._halted = self._strobed = False
 
     def stop(self, link: Link) -> None:
-        """Stand where it is, powered. Raises DriverError."""
+        """Stop at the current position, powered. Raises DriverError."""
         self._order, self._strobed = None, False
         if not self._halted:
             self._halted = True
@@ -190,7 +190,7 @@ class Gripper:
                 link.send([self._command(ControlWord.ENABLE_OPERATION | HALT)])
 
     def poll(self, link: Link) -> AxisFault | None:
-        """Take the drive's frames and send what is due. Returns what is wrong with it. Raises DriverError."""
+        """Process the drive's frames and send pending commands. Returns its fault as text. Raises DriverError."""
         if not self._watching:
             return None
         now_ns = link.now_ns()
@@ -250,7 +250,7 @@ class Gripper:
         return None
 
     def _due(self, now_ns: int) -> list[CanFrame]:
-        """Frames after a status: the next step of enabling, or of the handshake by which an order is taken."""
+        """Frames after a status: the next step of enabling, or of the handshake by which a command is accepted."""
         axis = self.axis
         if not self._on:
             return []

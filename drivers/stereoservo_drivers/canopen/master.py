@@ -1,8 +1,8 @@
 """The cyclic CAN master, without I/O: time and frames in, frames out.
 
-A tick closes the books on the cycle that ends, judges it, and gives the frames of the next: poll, axes, heartbeat.
-The first fault latches; from then on every tick sends target zero and quick stop to all axes, until ``clear``. Nothing
-here clears a fault or enables by itself.
+A tick closes the cycle that ends, checks it, and returns the frames of the next: poll, axes, heartbeat. The first fault
+latches; from then on every tick sends target zero and quick stop to all axes, until ``clear``. Nothing here clears a
+fault or enables by itself.
 
 Threads: ``tick`` and ``receive`` belong to one; the rest may be called from another.
 """
@@ -37,11 +37,11 @@ __all__ = ["ENABLE_LIMIT_S", "Master", "MasterFault", "MasterSettings", "MasterS
 ENABLE_LIMIT_S = 1.5
 STOP_MARGIN_S = 0.1
 REST_SHARE = 0.01
-"""Of the largest velocity: slower than this a joint that is commanded to zero counts as at rest."""
+"""Share of the largest velocity below which a joint that is commanded to zero counts as at rest."""
 REST_CYCLES = 3
 FRESH_CYCLES = 2
 RESOLUTION_SAID = 1e-3
-"""[rad/s or m/s] A command that the wire's resolution changes by more is reported."""
+"""[rad/s or m/s] A larger change of a command by the wire's resolution is reported."""
 
 
 @dataclass
@@ -55,7 +55,7 @@ class _Monitors:
 
 @dataclass
 class _Cycle:
-    """The cycle in progress; ``owed_ns``: the first poll since the last complete answer, which this may be."""
+    """The current cycle; ``owed_ns``: the first poll since the last complete answer; its answers may belong to it."""
 
     poll_ns: int = 0
     owed_ns: int = 0
@@ -66,9 +66,7 @@ class _Cycle:
 
 
 class Master:
-    """Cyclic master over a ``codec``. ``fault`` is the first one, None while there is none; ``also`` the later
-    ones.
-    """
+    """Cyclic master over a ``codec``. ``fault``: the first one, None while there is none; ``also``: the later ones."""
 
     def __init__(self, codec: Codec, settings: MasterSettings) -> None:
         self.codec = codec
@@ -124,7 +122,7 @@ class Master:
         self._called_ns = now_ns
 
     def port_called(self, now_ns: int) -> None:
-        """Note that the port's user is alive."""
+        """Record that the port's user is alive."""
         self._called_ns = now_ns
 
     def request_enable(self, now_ns: int) -> None:
@@ -138,7 +136,7 @@ class Master:
         self._request = "disable"
 
     def latch(self, fault: MasterFault) -> None:
-        """Latch ``fault``: the first one; later ones are kept in ``also`` (each code and axis once)."""
+        """Latch ``fault``: the first one; later ones are appended to ``also`` (each code and axis once)."""
         if self.fault is None:
             self.fault = fault
             return
@@ -147,7 +145,7 @@ class Master:
             self.also.append(fault)
 
     def clear(self) -> None:
-        """Clear the latched fault and all observations. The axes are off, and stay off until enabled.
+        """Clear the latched fault and all observations. The axes are off, and remain off until enabled.
 
         Call it while the cycle is not running. A drive that is still in fault latches again with the next answers.
         """
@@ -161,7 +159,7 @@ class Master:
         return self._sample
 
     def stands(self) -> bool | None:
-        """Whether all axes are at rest by the newest complete set; None where that is too old."""
+        """Whether all axes are at rest by the newest complete set; None if that is too old."""
         sample, poll_ns = self._sample, self._cycle.poll_ns
         if sample is None or poll_ns - sample.t_ns > FRESH_CYCLES * self._period_ns:
             return None
@@ -231,7 +229,7 @@ class Master:
         self.statistics.answered_max_ns = max(self.statistics.answered_max_ns, now_ns - poll_ns)
 
     def tick(self, now_ns: int) -> list[CanFrame]:
-        """End the cycle in progress and begin the next; returns the frames to send now, in order."""
+        """End the current cycle and start the next; returns the frames to send now, in order."""
         complete = self._cycle.received == self.codec.expected
         if self._cycle.open:
             self._close(now_ns, complete)
@@ -267,7 +265,7 @@ class Master:
         for fault in self.codec.faults():
             self.latch(self._from_axis(fault, now_ns))
         for trip in (
-            monitors.flood.end_cycle(cycle_ns),  # before what a flood makes the drives miss
+            monitors.flood.end_cycle(cycle_ns),  # before it makes the drives miss frames
             monitors.frames.verdict(self._period_s),
             monitors.lateness.end_cycle(monitors.frames.owing),
             *self._watch_encoders(cycle_ns),
@@ -390,7 +388,7 @@ class Master:
 
 
 class Mode(StrEnum):
-    """What the master commands the axes to do."""
+    """Modes of the master's commands to the axes."""
 
     OFF = "off"
     ENABLING = "enabling"
@@ -400,8 +398,8 @@ class Mode(StrEnum):
 
 
 class MasterFault(msgspec.Struct, frozen=True):
-    """The fault that ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: where there
-    are some.
+    """The fault that ended motion. ``axis``: the joint's name, empty for the bus. ``value``, ``limit``: if there are
+    any.
     """
 
     code: str
@@ -446,8 +444,7 @@ class MasterSettings(msgspec.Struct, frozen=True):
 
 @dataclass
 class MasterStatistics:
-    """Statistics since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two
-    ticks.
+    """Statistics since the start. ``incomplete``: cycles that missed a frame. ``longest_cycle_ns``: between two ticks.
 
     ``answered_ns``: from the newest complete cycle's poll to its last frame; ``answered_max_ns``: the largest.
     """
@@ -471,12 +468,10 @@ def limit_command(
     position_min: FloatArray,
     position_max: FloatArray,
 ) -> tuple[FloatArray, tuple[str, ...]]:
-    """Velocities (n,) within the drives' limits, and why they differ (``drive_velocity_limit``,
-    ``position_limit``).
+    """Velocities (n,) within the drives' limits, and why they differ (``drive_velocity_limit``, ``position_limit``).
 
-    Beyond a velocity limit all joints are scaled alike, so that the direction of motion is kept. A joint at or
-    beyond a position limit may only move inward; the others continue. Joints whose position is not known
-    (NaN) do not move.
+    Beyond a velocity limit all joints are scaled alike, so that the direction of motion is kept. A joint at or beyond a
+    position limit may only move inward; the others continue. Joints of unknown position (NaN) do not move.
     """
     reasons: tuple[str, ...] = ()
     excess = float((np.abs(velocities) / max_velocities).max())

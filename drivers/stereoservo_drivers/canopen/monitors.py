@@ -1,6 +1,6 @@
 """Monitors of the CAN master: missed, doubled, late and foreign frames; encoder jumps; motion against the command.
 
-Every monitor takes what a cycle brought and gives a :class:`Trip` or None. No clock, no I/O.
+Each monitor evaluates the data of a cycle and returns a :class:`Trip` or None. No clock, no I/O.
 """
 
 from __future__ import annotations
@@ -14,24 +14,27 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray
 
 DOUBLES_IN_A_ROW = 3
-"""One double may be a frame that waited on a busy bus; several in a row are two drives with one node id."""
+"""A single duplicate may be a frame delayed by a busy bus; several in a row are two drives with one node id."""
 OWED_CYCLES = 25
-"""So long a frame that was missed may still come, beside that of its cycle: a held-up host or adapter is no double."""
+"""Cycles within which a missed frame may still arrive, in addition to its cycle's: no duplicate, but a delayed host or
+adapter.
+"""
 LATE_WINDOW = 25
 LATE_RANK = LATE_WINDOW // 5
 LATE_BASELINES = 16
-"""So many looks at windows in which no frame was owed make the baseline."""
+"""Number of evaluated windows without owed frames that determine the baseline."""
 LATE_EVERY = 5
-"""Cycles; divides the window."""
+"""Interval of evaluations [cycles]; divides the window."""
 LATE_SHARE = 0.35
-"""Of the period: later than its own baseline by so much, compared with the other drives, a drive is late. A quarter,
-and a tenth because the resolution of arrival times is that of reading the bus (an eighth of the period)."""
+"""Share of the period: a drive is late if it exceeds its own baseline by this, compared with the other drives. A
+quarter, and a tenth for the resolution of arrival times, which is the interval of reads (an eighth of the period).
+"""
 LATE_SHARE_SINGLE = 0.5
-"""The same of an only drive, which nothing can be compared with."""
+"""The same for a single drive, which cannot be compared with others."""
 FLOOD_WINDOW = 5
 FLOOD_SHARE = 0.30
 FLOOD_FRAME_BITS = 111
-"""A data frame of 8 bytes without stuffing (CiA 301, ISO 11898-1)."""
+"""Length of a data frame of 8 bytes without stuffing (CiA 301, ISO 11898-1)."""
 JUMP_FACTOR = 3.0
 JUMP_COUNTS = 16.0
 REVERSED_EVERY_S = 0.02
@@ -42,7 +45,7 @@ REVERSED_COUNTS = 8.0
 
 
 class Trip(msgspec.Struct, frozen=True):
-    """Reason of a monitor to end motion. ``bit`` or ``axis``: the one at fault, -1: none in particular."""
+    """Reason of a monitor to end motion. ``bit`` or ``axis``: the faulty one, -1: none in particular."""
 
     code: str
     message: str
@@ -60,7 +63,7 @@ class FrameCounter:
         self._names = names
         self._max_missed = max_missed
         self.counts = [0] * len(names)
-        """Frames of the cycle under way, by bit, written by the receiver."""
+        """Frames of the current cycle, by bit, written by the receiver."""
         self._once = [1] * len(names)
         self._clean = False
         self._misses = [0] * len(names)
@@ -68,7 +71,7 @@ class FrameCounter:
         self._owed = [0] * len(names)
         self._calm = 0
         self.owing = False
-        """Whether a frame was missed that may still come."""
+        """Whether a frame was missed that may still arrive."""
         self.lost = 0
         self.doubled = 0
 
@@ -117,7 +120,7 @@ class FrameCounter:
         if worst <= self._max_missed:
             return None
         waited = f"{worst} cycles ({worst * period_s * 1e3:.0f} ms), limit {self._max_missed}"
-        # A bus that went quiet in the middle of a cycle: the answers before that moment count one miss less.
+        # If the bus became silent during a cycle, the frames answered before that have one miss less.
         if len(self._misses) > 1 and min(self._misses) >= self._max_missed:
             return Trip(
                 "bus_silent",
@@ -154,11 +157,11 @@ class FrameCounter:
 class LatenessMonitor:
     """Monitors the delay of frames after their poll against its baseline.
 
-    A drive that is late by more than a cycle answers as often as one in time; only its phase shows it. Of the
-    arrivals in ``LATE_WINDOW`` cycles the one counts that a fifth of them undercut: a drive that is late is so in
-    nearly all cycles, a busy host in some. The baseline is the smallest such value of the first windows in which no
-    frame was owed: after a miss an early frame may be the late one of the cycle before. What all axes have in
-    common is the host's or the bus's doing (a buffering adapter) and no reason to stop: it is taken off.
+    A drive that is late by more than a cycle answers as often as one in time; only its phase shows it. Of the arrivals
+    in ``LATE_WINDOW`` cycles the lower quintile is used: a late drive is late in nearly all cycles, a busy host in
+    some. The baseline is the smallest such value of the first windows in which no frame was owed: after a miss an early
+    frame may be the late one of the previous cycle. A delay common to all axes is caused by the host or the bus (a
+    buffering adapter) and no reason to stop: it is subtracted.
     """
 
     def __init__(self, names: tuple[str, ...], bit_axis: tuple[int, ...], period_ns: int) -> None:
@@ -168,7 +171,7 @@ class LatenessMonitor:
         self._limit_ns = period_ns * (LATE_SHARE if len(set(bit_axis)) > 1 else LATE_SHARE_SINGLE)
         self._arrivals = np.zeros((LATE_WINDOW, len(names)))
         self.arrivals = [0] * len(names)
-        """[ns] after the poll, by bit, written by who receives; of a frame that does not come the last one is kept."""
+        """[ns] after the poll, by bit, written by the receiver; the last value is kept if a frame does not arrive."""
         self._newest: list[list[int]] = []
         self._cycles = 0
         self._baseline = np.full(len(names), math.inf)
@@ -176,7 +179,7 @@ class LatenessMonitor:
         self._looks = 0
 
     def end_cycle(self, owing: bool) -> Trip | None:
-        """Evaluate every ``LATE_EVERY`` cycles, once there is a baseline. ``owing``: a missed frame may still come."""
+        """Evaluate every ``LATE_EVERY`` cycles, once there is a baseline. ``owing``: missed frames may still arrive."""
         self._settled = 0 if owing else self._settled + 1
         self._newest.append(self.arrivals.copy())
         self._cycles += 1
@@ -215,7 +218,8 @@ class LatenessMonitor:
 class FloodMonitor:
     """Monitors frames outside of the cycle: one id's share of the bus over the last ``FLOOD_WINDOW`` cycles.
 
-    By id, since after a stall of the host or the adapter the heartbeats and emergencies of all nodes come at once.
+    Counted by id, since after a stall of the host or the adapter the heartbeats and emergencies of all nodes arrive at
+    once.
     """
 
     def __init__(self, bitrate: int, period_s: float) -> None:
@@ -233,7 +237,7 @@ class FloodMonitor:
             self._heard += 1
 
     def end_cycle(self, cycle_ns: int) -> Trip | None:
-        """Evaluate every cycle, so that a flood is named before the drives' own frames are missed."""
+        """Evaluate every cycle, so that a flood is reported before the drives' own frames are missed."""
         forgotten = self._cycles[0][1]
         if forgotten:
             self._heard -= sum(forgotten.values())
@@ -262,9 +266,9 @@ class FloodMonitor:
 class JumpMonitor:
     """Monitors position changes larger than the axis can move.
 
-    An answer that came late, or was read late by a busy computer, counts in a later cycle than it was asked for. So of
-    a set is known only that it was measured between the first poll that was not answered and its arrival; what can lie
-    between two sets is the time from the former of one to the latter of the next.
+    An answer that arrived late, or was read late by a busy computer, counts in a later cycle than it was requested in.
+    A set was therefore measured between the first unanswered poll and its arrival; the longest time between two sets is
+    from the former of one to the latter of the next.
     """
 
     def __init__(self, max_velocities: FloatArray, resolutions: FloatArray) -> None:
@@ -302,8 +306,8 @@ class JumpMonitor:
 class ReversalMonitor:
     """Monitors axes that move against their command.
 
-    Compares over ``REVERSED_WINDOW_S`` the travel that the commands ask for, ramped at the joint's acceleration, with
-    the measured one. Opposite signs for ``REVERSED_FOR_S`` trip: longer than any drive lags behind its ramp.
+    Compares over ``REVERSED_WINDOW_S`` the commanded travel, ramped at the joint's acceleration, with the measured one.
+    Opposite signs for ``REVERSED_FOR_S`` trip: longer than any drive lags behind its ramp.
     """
 
     def __init__(self, accelerations: FloatArray, resolutions: FloatArray, period_s: float) -> None:

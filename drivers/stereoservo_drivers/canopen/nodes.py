@@ -1,5 +1,5 @@
 """CiA 402 drives on a bus before anything is configured. For `stereoservo setup`: adapters of this computer, the bit
-rate of a bus, the drives on it, what they tell of themselves. For ``doctor``: presence, identity, state and limits of a
+rate of a bus, the drives on it, their reported properties. For ``doctor``: presence, identity, state and limits of a
 cell's drives. Nothing is written to a drive.
 """
 
@@ -43,9 +43,9 @@ from stereoservo_drivers.options import decode_options
 BITRATES = (1_000_000, 500_000, 250_000, 125_000, 800_000, 100_000, 50_000, 20_000)
 """Bit rates of CiA 301 [bit/s], the commonest first."""
 NOT_HARDWARE = ("virtual", "udp_multicast", "slcan", "serial", "seeedstudio")
-"""Interfaces that need no adapter, or take any serial port for theirs."""
+"""Interfaces that need no adapter, or accept any serial port as theirs."""
 HARDLY_LIMITS = 2**31 - 2**16
-"""[counts] Limits that are as wide as the counter are none."""
+"""[counts] Limits at least as wide as the counter limit nothing."""
 ENCODER, TURNS = (0x608F, 1), (0x608F, 2)
 POSITION_LIMITS = ((0x607D, 1), (0x607D, 2))
 POSITION = (0x6064, 0)
@@ -53,7 +53,7 @@ SLCAN, SLCAN_SOCKET = "stereoservo_slcan", "socket://"
 
 
 class SerialPort(Protocol):
-    """What pyserial tells of a serial port."""
+    """Properties of a serial port reported by pyserial."""
 
     device: str
     description: str
@@ -64,7 +64,7 @@ def found_buses(
     detect: Callable[[], Sequence[Mapping[str, Any]]] = can.detect_available_configs,
     ports: Callable[[], Iterable[SerialPort]] = list_ports.comports,
 ) -> tuple[FoundBus, ...]:
-    """CAN adapters that python-can detects, then USB serial ports, behind which a serial-line adapter may be."""
+    """CAN adapters detected by python-can, then USB serial ports, to which a serial-line adapter may be connected."""
     found: list[FoundBus] = []
     for config in _quietly(detect):
         interface, channel = str(config["interface"]), config["channel"]
@@ -83,7 +83,7 @@ def found_buses(
 
 
 def _quietly(detect: Callable[[], Sequence[Mapping[str, Any]]]) -> Sequence[Mapping[str, Any]]:
-    """python-can's detection without its warnings of every maker's library that is not there."""
+    """python-can's detection without its warnings about missing vendor libraries."""
     log = logging.getLogger("can")
     before = log.level
     log.setLevel(logging.CRITICAL)
@@ -123,12 +123,12 @@ class ScanLink(Subscriptions):
 def scan_bus(options: Mapping[str, Any], bitrates: Sequence[int] = BITRATES) -> BusScan:
     """Drives on the bus of ``options`` (interface, channel, bitrate, interface_options).
 
-    Where nothing answers at the stated bit rate, the others are tried, and one at which drives answer is a finding.
-    Raises DriverError.
+    If no node answers at the stated bit rate, the others are tried; one at which drives answer is reported as a
+    finding. Raises DriverError.
     """
     stated = int(options.get("bitrate", _kernels_bitrate(options) or BITRATES[0]))
     rates = [stated, *(rate for rate in bitrates if rate != stated)]
-    if options["interface"] == "socketcan":  # its bit rate is the kernel's, and checked when it is opened
+    if options["interface"] == "socketcan":  # its bit rate is set by the kernel, and checked when it is opened
         rates = [stated]
     for rate in rates:
         settings = ChannelSettings(
@@ -151,7 +151,7 @@ def scan_bus(options: Mapping[str, Any], bitrates: Sequence[int] = BITRATES) -> 
 
 
 def _kernels_bitrate(options: Mapping[str, Any]) -> int | None:
-    """Bit rate that the kernel has of a socketcan interface; None of others, or where it tells none."""
+    """Bit rate of a socketcan interface in the kernel; None for other interfaces, or if the kernel reports none."""
     state = read_state(str(options["channel"])) if options["interface"] == "socketcan" else None
     return None if state is None else state.bitrate
 
@@ -167,7 +167,7 @@ def wrong_bitrate(nodes: Sequence[int], rate: int, stated: int) -> ExaminationFi
 
 
 def other_bitrate(options: Mapping[str, Any]) -> ExaminationFinding | None:
-    """Finding on a bus where nobody answers at the stated bit rate and somebody does at another; None otherwise."""
+    """Finding on a bus on which nodes answer only at another bit rate than the stated one; None otherwise."""
     if options["interface"] == "socketcan":
         return None
     stated = int(options["bitrate"])
@@ -185,7 +185,7 @@ def answering(settings: ChannelSettings) -> list[int]:
     try:
         return list(scan(ScanLink(channel)))
     except DriverError as error:
-        if error.code in ("bus_off", "send_timeout", "send_refused"):  # as a wrong bit rate ends
+        if error.code in ("bus_off", "send_timeout", "send_refused"):  # the usual effect of a wrong bit rate
             return []
         raise
     finally:
@@ -230,7 +230,7 @@ def _duplicate(name: str, node: int, count: int) -> ExaminationFinding:
 
 
 def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
-    """What a node tells of itself; a finding where it is no drive."""
+    """Properties reported by a node; a finding if it is not a drive."""
     anything = CanJoint(
         name="?", node_id=node, counts_per_rev=1.0, max_velocity=1.0, max_acceleration=1.0,
         quick_stop_deceleration=1.0, position_min=-1.0, position_max=1.0,
@@ -261,7 +261,7 @@ def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
 
 
 def stated_limits(low: int | None, high: int | None) -> tuple[int, int] | None:
-    """Software position limits [counts] as 0x607D has them; None where they limit nothing."""
+    """Software position limits [counts] in 0x607D; None if they limit nothing."""
     if low is None or high is None or low >= high or (low <= -HARDLY_LIMITS and high >= HARDLY_LIMITS):
         return None
     return low, high
@@ -273,7 +273,7 @@ RATES = (250.0, 200.0, 150.0, 125.0, 100.0, 75.0, 50.0, 25.0, 10.0)
 
 
 def proposed_options(scan: BusScan, joints: Sequence[JointChoice]) -> dict[str, Any]:
-    """Options of the driver for the drives of a scan, at the fastest usual rate that the bus carries."""
+    """Options of the driver for the drives of a scan, at the fastest usual rate that the bus allows."""
     tables = []
     for choice in joints:
         known = {key: value for key, value in choice.drive.options.items() if key in IDENTITY}
@@ -313,7 +313,7 @@ _WIRING = "is it powered, is its cable in, are its bit rate and its node id thos
 
 
 def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir: Path) -> Iterator[ExaminationFinding]:
-    """Findings on every node; nothing is written to any drive. Raises DriverError where the bus is lost."""
+    """Findings on every node; nothing is written to any drive. Raises DriverError if the bus is lost."""
     answers = scan(link)
     grippers = {each.node_id: Gripper(options, each, cell_dir) for each in options.gripper}
     known = [*codec.axes, *(gripper.axis for gripper in grippers.values())]
@@ -341,7 +341,7 @@ def examine_nodes(link: Link, options: CanOptions, codec: Cia402Codec, cell_dir:
 
 
 def _gripper(drive: RemoteDrive, gripper: Gripper) -> ExaminationFinding:
-    """Finding on a gripper's mode and on what it does where this computer is gone. Raises DriverError."""
+    """Finding on a gripper's mode and on its reaction to the loss of this computer. Raises DriverError."""
     setup = gripper.compose(drive, capabilities(drive))
     return ExaminationFinding(
         f"{drive.name} mode", None if setup.losses else True, f"profile position (1); {setup.safety()}"
@@ -389,7 +389,7 @@ def _identity(drive: RemoteDrive, joint: CanJoint) -> ExaminationFinding:
 
 
 def limits_findings(joint: CanJoint, low: int | None, high: int | None) -> Iterator[ExaminationFinding]:
-    """Finding on the cell file's position limits against the drive's own (0x607D) [counts]; none where it has none."""
+    """Finding on the cell file's position limits against the drive's own (0x607D) [counts]; none if it has none."""
     limits = stated_limits(low, high)
     if limits is None:
         return
@@ -440,7 +440,7 @@ def _past_errors(drive: RemoteDrive) -> list[int]:
 
 
 def _modes(drive: RemoteDrive, options: CanOptions) -> ExaminationFinding:
-    """Modes, watches and what is lost, as the drive would be configured; raises DriverError as that does."""
+    """Modes, monitoring and restrictions, as the drive would be configured; raises DriverError as that does."""
     name = f"{drive.axis.name} modes"
     supported = drive.read_if_there(0x6502)
     if supported is None:

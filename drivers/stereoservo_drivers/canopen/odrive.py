@@ -1,13 +1,13 @@
-"""Codec of ODrive's CANSimple (firmware 0.6): identifier = node id << 5 | command, little-endian float32 in turns
-and turns/s.
+"""Codec of ODrive's CANSimple (firmware 0.6): identifier = node id << 5 | command, little-endian float32 in turns and
+turns/s.
 
-Encoder estimates of all axes are asked for by remote frames every cycle; errors and torques in turn, ``SHARE`` axes a
-cycle, since six axes at 250 Hz on 1 Mbit/s leave no room for more. Axis states come with the drives' own heartbeats.
+Encoder estimates of all axes are requested by remote frames every cycle; errors and torques in turn, ``SHARE`` axes per
+cycle, since six axes at 250 Hz on 1 Mbit/s leave no capacity for more. Axis states are in the drives' own heartbeats.
 
 A stop is velocity zero in closed loop, ramped down and repeated every cycle: it keeps torque on the joint. Estop (0x02)
-and the idle state disarm the motor, and a gravity axis without a brake falls: neither is ever sent to a moving arm.
-The velocity ramps are made here, at the joint's ``max_acceleration`` and ``quick_stop_deceleration``, since
-CANSimple has no message that sets the drive's own (``vel_ramp_rate``).
+and the idle state disarm the motor, and a gravity axis without a brake falls: neither is ever sent to a moving arm. The
+velocity ramps are computed here, at the joint's ``max_acceleration`` and ``quick_stop_deceleration``, since CANSimple
+has no message that sets the drive's own (``vel_ramp_rate``).
 """
 
 from __future__ import annotations
@@ -39,10 +39,10 @@ IDLE, CLOSED_LOOP_CONTROL = 1, 8
 VELOCITY_CONTROL, PASSTHROUGH = 2, 1
 
 SHARE = 2
-"""Axes a cycle that are asked for errors, and likewise for torques."""
+"""Number of axes per cycle of which errors are requested, and likewise torques."""
 
 RESOLUTION_TURNS = 2.0**-12
-"""Taken for the smallest step of a position, which is no count here: of a coarse encoder."""
+"""Assumed smallest step of a position, that of a coarse encoder: ODrive does not report counts."""
 
 _U32X2 = struct.Struct("<II")
 _F32X2 = struct.Struct("<ff")
@@ -292,7 +292,7 @@ class OdriveCodec:
         return [axis.towards(goal, axis.step) for axis, goal in zip(self.axes, turns_s, strict=True)]
 
     def quick_stop(self) -> list[CanFrame]:
-        """Frames: the next step of every axis's ramp to zero; torque stays on."""
+        """Frames: the next step of every axis's ramp to zero; torque remains on."""
         return [axis.towards(0.0, axis.stop_step) for axis in self.axes]
 
     def sendable(self, velocities: FloatArray) -> FloatArray:

@@ -1,10 +1,10 @@
 """Bring-up of ODrives over CANSimple: presence, unique node ids, velocity control, and reset of errors on request.
 
-The axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an axis when velocities cease,
-and the rates of cyclic messages are configured over USB. The watchdog is all that stops a joint when this host or the
-cable dies. It, the limit of the velocity and the controller's mode are read back by RxSdo and TxSdo where the cell file
-has the endpoints of the drive's release (``flat_endpoints.json``), whose numbers change with every release; else they
-are unknown, and told so: pull the cable once, arm at low speed, before you trust them.
+The axis watchdog (``axis0.config.enable_watchdog``, ``watchdog_timeout``), which disarms an axis when no velocities
+arrive, and the rates of cyclic messages are configured over USB. Only the watchdog stops a joint when this host or the
+cable fails. The watchdog, the velocity limit and the controller's mode are read back by RxSdo and TxSdo if the cell
+file has the endpoints of the drive's release (``flat_endpoints.json``), whose numbers change with every release;
+otherwise they are unknown, and reported as such: pull the cable once, with the arm at low speed, before you trust them.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from stereoservo_drivers.canopen.options import CanOptions
 
 STEP_S = 0.01
 HEARTBEAT_WAIT_S = 0.5
-"""Heartbeats come every 100 ms unless configured otherwise."""
+"""Time limit for heartbeats [s]: they come every 100 ms unless configured otherwise."""
 ANSWER_WAIT_S = 0.05
 QUIET_S = 0.05
-"""Time in which no unrequested encoder estimates and no commands of another master may come."""
+"""Duration of the check for unrequested encoder estimates and for commands of another master [s]."""
 PROTOCOL_VERSION = 2
 ALL_NODES = tuple(range(63))
 
@@ -39,7 +39,7 @@ CONTROL_MODE, INPUT_MODE = "axis0.controller.config.control_mode", "axis0.contro
 CHECKED = (WATCHDOG, WATCHDOG_S, SPEED, RAMP, CONTROL_MODE, INPUT_MODE)
 TYPES = {"bool": "?", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h", "uint32": "I", "int32": "i", "float": "f"}
 LEAST_CYCLES = 2.0
-"""Velocities that may be missing before the watchdog disarms: a shorter one trips by a single late cycle."""
+"""Least time-out of the watchdog [cycles]: a shorter one trips because of a single late cycle."""
 
 Heard = dict[int, list[CanFrame]]
 """Data frames by node id."""
@@ -88,8 +88,8 @@ def _layout(release: Release, name: str) -> tuple[int, struct.Struct] | None:
 
 
 class OdriveBringup:
-    """Bring-up of the axes of one bus. ``firmware``, ``safety``: by node id, once connected: version, and what is known
-    of the watchdog, limit and ramp, as text with whether all of it is.
+    """Bring-up of the axes of one bus. ``firmware``, ``safety``: by node id, once connected: version, and the known
+    values of watchdog, limit and ramp, as text, with whether all of them are known.
     """
 
     def __init__(self, options: CanOptions, codec: OdriveCodec, cell_dir: Path) -> None:
@@ -110,7 +110,7 @@ class OdriveBringup:
         ``second_master``, ``no_watch``, ``watchdog``, ``limit``, ``mode``.
         """
         self._check_alone(link)
-        # Whom a master that died has left moving: before anything that can fail, and long before the idle state.
+        # Axes that a dead master has left moving: before anything that can fail, and long before the idle state.
         link.send([axis.velocity(0.0) for axis in self.codec.axes])
         self._await_heartbeats(link)
         self._check_identities(link)
@@ -153,7 +153,7 @@ class OdriveBringup:
         link.send([axis.request(odrive.IDLE) for axis in self.codec.axes])
 
     def _ask(self, link: Link, command: int) -> Heard:
-        """All replies of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises where one has none."""
+        """All replies of all nodes to a remote frame within ``ANSWER_WAIT_S``; raises if one has none."""
         with _listening(link, self._nodes, command) as received:
             link.send([axis.remote(command) for axis in self.codec.axes])
             link.wait(ANSWER_WAIT_S)
@@ -230,7 +230,7 @@ class OdriveBringup:
             self._hardware[node] = ".".join(str(number) for number in data[1:4])
 
     def _check_estimates(self, link: Link) -> None:
-        """Check that an estimate comes only on request (in the cycle others would look like a second drive's)."""
+        """Check that an estimate is only sent on request (in the cycle others would look like a second drive's)."""
         with _listening(link, self._nodes, odrive.GET_ENCODER_ESTIMATES) as unasked:
             link.wait(QUIET_S)
         for node, frames in unasked.items():
@@ -262,7 +262,7 @@ class OdriveBringup:
                 link.send([CanFrame(frame_id(node, odrive.SET_LIMITS), limits)])
 
     def _check_settings(self, link: Link) -> None:
-        """Read back what keeps each axis safe, where its release is known. Raises DriverError where it does not."""
+        """Read back each axis's protective settings, if its release is known. Raises DriverError if they are unsafe."""
         for node, axis in self._axes.items():
             firmware, hardware = self.firmware[node], self._hardware[node]
             known = [r for r in self._releases if (r.fw_version, r.hw_version) == (firmware, hardware)]
@@ -280,9 +280,9 @@ class OdriveBringup:
             self.safety[node] = check_settings(axis, found, self._options)
 
     def _read(self, link: Link, node: int, release: Release, name: str) -> float | None:
-        """One property by RxSdo; None where no answer comes."""
+        """One property by RxSdo; None if no answer arrives."""
         layout = _layout(release, name)
-        assert layout is not None  # as load_release has checked
+        assert layout is not None  # as checked by load_release
         number, answer = layout
         with _listening(link, (node,), odrive.TX_SDO) as received:
             request = struct.pack("<BHBI", 0, number, 0, 0)
@@ -320,7 +320,7 @@ def _answers(frames: list[CanFrame], number: int, answer: struct.Struct) -> list
 
 
 def check_settings(axis: odrive.Axis, values: dict[str, float], options: CanOptions) -> tuple[bool, str]:
-    """Judge what an axis has set; returns whether all is well, and what is set, as text.
+    """Check an axis's settings; returns whether all are valid, and the settings as text.
 
     Raises DriverError: ``no_watch``, ``watchdog`` (shorter than the cycle or longer than ``heartbeat_timeout_ms``),
     ``limit`` (below the joint's largest velocity), ``mode`` (not the one that was set).

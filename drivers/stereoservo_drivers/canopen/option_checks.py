@@ -17,13 +17,13 @@ from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import INT32_MAX, UINT32_MAX, JointScale
 
 LONGEST_TURN = 2.0 * math.pi
-"""[rad] A joint that goes further from zero turns more than once, which needs ``multi_turn``."""
+"""[rad] A joint that moves further from zero turns more than once, which needs ``multi_turn``."""
 FASTEST_TURN = 4.0 * math.pi
-"""[rad/s] No joint of an arm is meant to be faster; the number is in degrees."""
+"""[rad/s] No joint of an arm is faster; a larger number is in degrees."""
 SDO_KEY = re.compile(r"0[xX][0-9A-Fa-f]{1,4}:([0-9]{1,3}|0[xX][0-9A-Fa-f]{1,2})")
 ODRIVE_HEARTBEATS_S = 10.0
 GRIPPER_HZ = 50.0
-"""How often a gripper's drive tells its state."""
+"""Rate at which a gripper's drive sends its state."""
 LAST_SYNCHRONOUS = 240
 """Largest transmission type that counts SYNCs (CiA 301)."""
 
@@ -67,7 +67,7 @@ def check_options(options: CanOptions) -> None:
 
 
 def check_load(options: CanOptions, guarded: int = 0) -> None:
-    """Check the bus's load, with so many drives ``guarded`` by remote frames. Raises DriverError (``option``)."""
+    """Check the bus's load, with the number of drives ``guarded`` by remote frames. Raises DriverError (``option``)."""
     load = bus_load(options, guarded)
     why = refusal(load, options.max_bus_load)
     if why is not None:
@@ -107,16 +107,16 @@ def _check_protocol(options: CanOptions) -> None:
 
 
 def syncs_of_gripper(rate_hz: float) -> int:
-    """Cycles in which a gripper's drive tells its state once."""
+    """Number of cycles per status of a gripper's drive."""
     return min(max(round(rate_hz / GRIPPER_HZ), 1), LAST_SYNCHRONOUS)
 
 
 def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:
-    """Worst-case load of the cycle and of the heartbeats beside it, with so many drives ``guarded``."""
+    """Worst-case load of the cycle and of the heartbeats, with the number of drives ``guarded``."""
     n = len(options.joint)
     if options.protocol == "odrive":
         asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
-        # Estimates are asked for by a remote frame, answered, and followed by a velocity; errors and torques in turn.
+        # Estimates are requested by a remote frame, answered, and followed by a velocity; errors and torques in turn.
         lengths = [0, 8, 8] * n + [0, 8] * asked_in_turn
         return cycle_load(lengths, options.rate_hz, options.bitrate, [(8, n * ODRIVE_HEARTBEATS_S)])
     further = [

@@ -25,13 +25,14 @@ POSITION_MODES = ("csp", "ip")
 
 
 class CanDrive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What joints and grippers tell of their drive [rad, s; m for prismatic joints].
+    """Options of a joint's or gripper's drive [rad, s; m for prismatic joints].
 
-    ``counts_per_rev``, ``velocity_units_per_rev_s``: of the motor (60: the drive speaks rpm; default: counts/s).
-    ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre. ``offset_rad``:
-    ``q = counts / k - offset``. ``position_min``, ``position_max``: the machine's limits. ``vendor_id``,
-    ``product_code``, ``revision``, ``serial_number``: checked against the drive's identity where given. ``sdo``:
-    further writes ``"index:subindex" = value``, verified by reading back.
+    ``counts_per_rev``, ``velocity_units_per_rev_s``: of the motor (60: the drive uses rpm; default: counts/s).
+    ``gear_ratio``: motor turns per joint turn; of a prismatic joint, motor turns per metre.
+    ``offset_rad``: ``q = counts / k - offset``.
+    ``position_min``, ``position_max``: the machine's limits.
+    ``vendor_id``, ``product_code``, ``revision``, ``serial_number``: compared with the drive's identity if given.
+    ``sdo``: further writes ``"index:subindex" = value``, verified by reading back.
     """
 
     name: str
@@ -55,11 +56,12 @@ class CanDrive(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
 class CanJoint(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One ``[[joints.options.joint]]``: a joint and its drive, as of `CanDrive`.
 
-    ``max_*`` go to the drive and clamp commands. ``rated_torque`` [N m or N at the joint] of 1000 permille; without it,
-    efforts are shares of it. ``current_limit`` [A]: protocol ``odrive`` only; where given, it and ``max_velocity``
-    become the drive's limits. ``accept_missing``: names what the drive may lack though the arm is less safe without it.
-    Of position modes: ``position_lead`` [rad or m], how far an order may be ahead of the joint; ``load_offset_max``,
-    how far the drive may stand off its order under load.
+    ``max_*``: sent to the drive, and limits of commands.
+    ``rated_torque``: [N m or N at the joint] of 1000 permille; without it, efforts are shares of it.
+    ``current_limit`` [A]: protocol ``odrive`` only; if given, it and ``max_velocity`` become the drive's limits.
+    ``accept_missing``: names of objects that the drive may lack although the arm is less safe without them.
+    ``position_lead`` [rad or m]: of position modes, largest distance of a position set-point ahead of the joint.
+    ``load_offset_max``: of position modes, largest offset of the drive from its set-point under load.
     """
 
     max_velocity: Positive
@@ -73,12 +75,12 @@ class CanJoint(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
 
     @property
     def lead(self) -> float:
-        """How far an ordered position may be ahead of the joint [rad or m]."""
+        """Largest distance of a position set-point ahead of the joint [rad or m]."""
         return self.position_lead or LEAD_S * self.max_velocity
 
     @property
     def largest_load_offset(self) -> float:
-        """How far the drive may stand off its ordered position under load [rad or m]."""
+        """Largest offset of the drive from its position set-point under load [rad or m]."""
         return LOAD_OFFSET[self.kind] if self.load_offset_max is None else self.load_offset_max
 
     def spec(self) -> JointSpec:
@@ -98,7 +100,7 @@ class CanJoint(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
 class CanOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """One ``[[joints.options.output]]``: a digital output of a joint's drive.
 
-    ``bit``: of 0x60FE:1, in CiA 402-2 0 is the brake, and those of the maker are 16 to 31.
+    ``bit``: of 0x60FE:1; in CiA 402-2 bit 0 is the brake, and bits 16 to 31 are the manufacturer's.
     """
 
     name: str
@@ -111,13 +113,14 @@ class CanOutput(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class CanGripper(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One ``[[joints.options.gripper]]``: an auxiliary joint on a CiA 402 drive of its own, as of `CanDrive`.
+    """One ``[[joints.options.gripper]]``: an auxiliary joint on its own CiA 402 drive, as of `CanDrive`.
 
-    The drive goes to ordered positions by itself (profile position, mode 1) at ``velocity`` with ``acceleration``.
-    ``torque_limit``: permille of the motor's rated torque (0x6072), with which it grips. ``quick_stop_option``,
-    ``abort_option``: what it does where this computer stops it or is gone; as they are, it brakes and keeps its torque,
-    so that it holds its part. ``eds``: of its drive, beside the cell file. ``profile``: a TOML file there with any of
-    these keys, which those in the cell file override.
+    The drive moves to commanded positions by itself (profile position, mode 1) at ``velocity`` with ``acceleration``.
+    ``torque_limit``: permille of the motor's rated torque (0x6072), with which it grips.
+    ``quick_stop_option``, ``abort_option``: reaction to a stop by this computer and to its loss; by default the drive
+    brakes and keeps its torque, so that it holds its part.
+    ``eds``: of its drive, beside the cell file.
+    ``profile``: a TOML file there with any of these keys, which are overridden by those in the cell file.
     """
 
     kind: Literal["revolute", "prismatic"] = "prismatic"
@@ -142,16 +145,18 @@ class CanGripper(CanDrive, frozen=True, forbid_unknown_fields=True, kw_only=True
 class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[joints.options]`` of driver ``canopen``.
 
-    ``interface``, ``channel``, ``bitrate``, ``interface_options``: as python-can takes them; ``stereoservo_slcan`` is
-    the fast serial-line CAN of this package. ``feedback``: what the drives send beside status word and position.
-    ``mode``: cyclic or profile velocity, cyclic or interpolated position; ``auto`` takes for each drive the first of
-    them that it has. ``rpdo_deadline_ms``: where the drives have such a timer; 0 leaves it off. ``emcy_ignore``:
-    emergency codes that do not trip.
-    ``endpoints``: of protocol ``odrive``, ``flat_endpoints.json`` of the releases that the drives run, beside the cell
-    file.
-    ``output``: digital outputs of the drives. ``gripper``: auxiliary joints on drives of their own.
-    ``command_timeout_s``: without a command for so long the joints are brought to rest (they stay enabled);
-    ``loop_timeout_ms``: without any call for so long, while enabled, the driver latches a fault.
+    ``interface``, ``channel``, ``bitrate``, ``interface_options``: as in python-can; ``stereoservo_slcan`` is the fast
+    serial-line CAN of this package.
+    ``feedback``: values that the drives send in addition to status word and position.
+    ``mode``: cyclic or profile velocity, cyclic or interpolated position; ``auto``: for each drive the first one it
+    has.
+    ``rpdo_deadline_ms``: for drives with such a timer; 0 leaves it off.
+    ``emcy_ignore``: emergency codes that do not trip.
+    ``endpoints``: of protocol ``odrive``, ``flat_endpoints.json`` of the drives' releases, beside the cell file.
+    ``output``: digital outputs of the drives.
+    ``gripper``: auxiliary joints on their own drives.
+    ``command_timeout_s``: without a command for this time the joints are brought to rest (they remain enabled).
+    ``loop_timeout_ms``: without any call for this time, while enabled, the driver latches a fault.
     """
 
     protocol: Literal["cia402", "odrive"] = "cia402"
@@ -181,7 +186,7 @@ class CanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 def can_options(options: Mapping[str, Any], cell_dir: Path) -> CanOptions:
-    """``[joints.options]`` with the grippers' profile files, which lie in ``cell_dir``. Raises DriverError."""
+    """``[joints.options]`` with the grippers' profile files, which are in ``cell_dir``. Raises DriverError."""
     grippers = options.get("gripper")
     if isinstance(grippers, list | tuple):
         options = {**options, "gripper": [_with_profile(gripper, cell_dir) for gripper in grippers]}

@@ -16,11 +16,11 @@ def clamp_int32(value: float) -> int:
     """``value`` rounded, within the range of a signed 32-bit integer."""
     if INT32_MIN <= value <= INT32_MAX:
         return round(value)
-    return round(min(max(value, INT32_MIN), INT32_MAX))  # NaN goes on to here, and round refuses it
+    return round(min(max(value, INT32_MIN), INT32_MAX))  # NaN passes this, and round refuses it
 
 
 def wrap_int32(counts: int) -> int:
-    """``counts`` as a signed 32-bit counter shows them."""
+    """``counts`` as a signed 32-bit counter represents them."""
     return (counts - INT32_MIN & UINT32_MAX) + INT32_MIN
 
 

@@ -31,7 +31,7 @@ WARNING = (
 
 
 class DriverCheckError(Exception):
-    """The command cannot be carried out; ``code`` is stable."""
+    """The command cannot be executed; ``code`` is stable."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -39,7 +39,7 @@ class DriverCheckError(Exception):
 
 
 class GivenDriver(JointDriverSetup):
-    """A driver class with its options, as the command line has them."""
+    """A driver class with its options, from the command line."""
 
     def __init__(self, driver: type[JointDriver], options: dict[str, Any], pull: bool, folder: Path) -> None:
         self.driver, self.options, self.pull, self.folder = driver, options, pull, folder
@@ -123,7 +123,7 @@ def driver_check(
 
 
 def _confirmed(question: str, default: bool) -> bool:
-    """The answer to a question; ``default`` where the input has ended. Raises KeyboardInterrupt."""
+    """The answer to a question; ``default`` if the input has ended. Raises KeyboardInterrupt."""
     try:
         return typer.confirm(question, default=default, err=True)
     except typer.Abort as abort:  # an interrupt, or the end of the input
@@ -134,7 +134,7 @@ def _confirmed(question: str, default: bool) -> bool:
 
 
 def _results(setup: JointDriverSetup, connected: bool, hardware: bool) -> list[CheckResult]:
-    """Run the checks; on hardware none after one that has failed, since the arm would move."""
+    """Run the checks; on hardware, none after a failed one, since the arm would move."""
     results: list[CheckResult] = []
     failed = ""
     for check in JOINT_CHECKS:
@@ -167,11 +167,11 @@ def _options(text: str, cell: CellFile | None) -> dict[str, Any]:
 
 
 def _setup(name: str, options: dict[str, Any], pull: bool, folder: Path) -> JointDriverSetup:
-    """What is to be checked. Raises DriverCheckError, plugins.PluginError."""
+    """The setup with the driver to check. Raises DriverCheckError, plugins.PluginError."""
     if ":" not in name:
         return GivenDriver(plugins.load(plugins.JOINT_DRIVERS, name), options, pull, folder)
     module, _, attribute = name.partition(":")
-    sys.path.insert(0, str(Path.cwd()))  # as python -m has it
+    sys.path.insert(0, str(Path.cwd()))  # as with python -m
     try:
         found = getattr(importlib.import_module(module), attribute)
     except Exception as error:  # whatever a third party's module raises on import
@@ -191,7 +191,7 @@ def _run(check: Any, setup: JointDriverSetup) -> CheckResult:
 
 
 def _report(driver: str, results: list[CheckResult], as_json: bool) -> None:
-    """Print the results. Raises typer.Exit where a check has failed."""
+    """Print the results. Raises typer.Exit if a check has failed."""
     counts = Counter(result.verdict for result in results)
     summary = ", ".join(f"{counts[verdict]} {verdict}" for verdict in ("passed", "failed", "not run"))
     failed = [result.name for result in results if result.verdict == "failed"]

@@ -33,7 +33,7 @@ Sights = dict[str, list[ImageArray]]
 
 
 class LearnError(Exception):
-    """The command cannot be carried out; ``code`` is stable."""
+    """The command cannot be executed; ``code`` is stable."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -134,7 +134,7 @@ def _text(answer: Mapping[str, Any]) -> list[str]:
 def _observations(
     cell: CellFile, path: Path, images: Path | None, pair: tuple[Path, Path] | None, frames: int, ask: bool
 ) -> tuple[Sights, Sights | None]:
-    """Images before a motion and, of live cameras where ``ask`` is set, after it."""
+    """Images before a motion and, for live cameras if ``ask`` is set, after it."""
     if images is not None:
         return _folder(cell, images, frames), None
     if pair is not None:

@@ -85,25 +85,25 @@ def _polarity(text: str) -> Polarity:
 
 
 def _short(lines: list[str]) -> list[str]:
-    """Cell file lines short enough to be printed below a plate; long ones are shown on the terminal only."""
+    """Cell file lines short enough to be printed below a plate; longer ones are shown only on the terminal."""
     if len(lines) > 4:
         return [lines[0], "detector_options: as `stereoservo print-plate` wrote them"]
     return lines
 
 
 # -- files ---------------------------------------------------------------------------------------------------
-# Pages of plates as SVG (one file a page) and as PDF (all in one), to scale.
+# Pages of plates as SVG (one file per page) and as PDF (all in one), to scale.
 
 
 HAIRLINE = 0.15
 """Width of lines [mm]."""
 DASH = (1.2, 0.8)
 MM = 72.0 / 25.4
-"""Points in a millimetre."""
+"""Points per millimetre."""
 
 
 def svg_text(page: Page) -> str:
-    """One page as SVG 1.1, user units of one millimetre."""
+    """One page as SVG 1.1, with user units of one millimetre."""
     size = f"{page.width:g}", f"{page.height:g}"
     lines = [
         '<?xml version="1.0" encoding="UTF-8"?>',
@@ -146,7 +146,7 @@ def write_pdf(pages: Sequence[Page], path: Path) -> None:
     from matplotlib.patches import Circle, Rectangle
     from matplotlib.text import Text as Words
 
-    # Text as text; without the date, the same plate is the same file.
+    # Text as text; without the date, the same plate yields the same file.
     with matplotlib.rc_context({"pdf.fonttype": 42}), PdfPages(path, metadata={"CreationDate": None}) as pdf:
         for page in pages:
             figure = Figure(figsize=(page.width / 25.4, page.height / 25.4))
@@ -173,9 +173,10 @@ def write_pdf(pages: Sequence[Page], path: Path) -> None:
 
 
 def write_pages(pages: Sequence[Page], path: Path, *, force: bool = False) -> list[Path]:
-    """Write ``pages`` to ``path``: ``.pdf`` in one file, ``.svg`` in one a page (NAME-1.svg, ... where there are more).
+    """Write ``pages`` to ``path``: ``.pdf`` in one file, ``.svg`` in one per page (NAME-1.svg, ... if there are
+    several).
 
-    Raises PlateError: ``format``, ``exists`` without ``force``, ``file`` where it cannot be written.
+    Raises PlateError: ``format``, ``exists`` without ``force``, ``file`` if it cannot be written.
     """
     kind = path.suffix.lower()
     if kind not in (".svg", ".pdf"):
@@ -200,7 +201,7 @@ def write_pages(pages: Sequence[Page], path: Path, *, force: bool = False) -> li
 
 
 def _replace(path: Path, write: Callable[[Path], object]) -> None:
-    """Write beside ``path`` and rename, such that the file is always complete."""
+    """Write beside ``path`` and rename, so that the file is always complete."""
     part = path.with_name(f".{path.name}.part")
     try:
         write(part)
@@ -224,16 +225,16 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
 
 Polarity = Literal["light", "dark"]
 PAPERS = {"a4": (210.0, 297.0), "a3": (297.0, 420.0), "letter": (215.9, 279.4)}
-"""Width and height [mm] of the papers that have a name."""
+"""Width and height [mm] of the named paper sizes."""
 BORDER = 8.0
-"""Left free on each side of a page [mm]: many printers cannot reach it."""
+"""Margin on each side of a page [mm]: many printers cannot reach it."""
 HEADER, BAR = 16.0, 11.0
-"""Heights of the lines on top, of the scale bar and of a line below [mm]."""
+"""Heights of the heading, of the scale bar and of a line below [mm]."""
 LINE = 3.4
 TEXT = 2.6
 BAR_MM = 100.0
 MARK = 5.0
-"""Length of a cutting mark, and its distance from what is cut [mm]."""
+"""Length of a cutting mark, and its distance from the cut plate [mm]."""
 CLEARANCE = 1.5
 LEAST_DOT_MM, LEAST_TAG_MM = 2.0, 5.0
 SMALLEST_DOT_PX = 6.0
@@ -243,13 +244,11 @@ grey levels, tilts to 30 degrees; further tilt foreshortens).
 SMALLEST_CELL_PX = 2.5
 """Cell [px] from which `aruco` reads tags reliably."""
 LEAST_GAP = 0.5
-"""Least black between two dots [diameters]."""
+"""Least black distance between two dots [diameters]."""
 
 
 class PlateError(Exception):
-    """A plate cannot be printed as requested. ``code`` is stable; the text holds the cause, the value, what would
-    be valid.
-    """
+    """A plate cannot be printed as requested. ``code`` is stable; the text has cause, value, and valid values."""
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
         super().__init__(message)
@@ -280,7 +279,7 @@ class Box:
 
 @dataclass(frozen=True)
 class Line:
-    """A hairline [mm]; dashed where paper is folded."""
+    """A hairline [mm]; dashed for a fold."""
 
     x0: float
     y0: float
@@ -311,7 +310,7 @@ class Page:
 
 @dataclass(frozen=True)
 class Plate:
-    """A square to cut out: ``side`` [mm], what is drawn on it about its top left corner, name and ids.
+    """A square to cut out: ``side`` [mm], the shapes drawn on it relative to its top left corner, name and ids.
 
     ``joins``: whether plates of this kind share an edge, to be folded.
     """
@@ -332,7 +331,7 @@ class DotPlates:
     spacing_mm: float | None = None
     polarity: Polarity = "light"
     millimetres: tuple[DotFace, ...] = field(init=False)
-    """The faces as they come out of the printer, all lengths in millimetres."""
+    """The faces in their printed size, all lengths in millimetres."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "millimetres", tuple(self._scaled(face) for face in self.faces))
@@ -507,7 +506,7 @@ def paper_named(text: str) -> tuple[float, float]:
 
 
 def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence[str]) -> list[Page]:
-    """Pages with ``plates`` in order and the text lines ``below``, as many plates a page as fit.
+    """Pages with ``plates`` in order and the text lines ``below``, as many plates per page as fit.
 
     Raises PlateError ``too_large``.
     """
@@ -583,7 +582,7 @@ def _marks(x: float, y: float, width: float, height: float) -> list[Line]:
 
 
 def _fold(x: float, y: float, side: float, *, beside: bool) -> list[Line | Text]:
-    """Marks of the edge that a plate shares with the one before it."""
+    """Marks of the edge that a plate shares with the previous one."""
     if beside:
         ends = [(x, y - CLEARANCE, 0, -1), (x, y + side + CLEARANCE, 0, 1)]
     else:
@@ -609,7 +608,7 @@ def _moved(shape: Disc | Box, x: float, y: float) -> Disc | Box:
 
 
 def _runs(row: Sequence[float] | np.ndarray[Any, Any]) -> list[tuple[int, int]]:
-    """First cell and one past the last of each run of black ones."""
+    """First cell, and one past the last, of each run of black cells."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], np.asarray(row) > 0.5, [0]]).astype(int)))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 

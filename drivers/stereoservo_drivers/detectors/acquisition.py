@@ -50,13 +50,13 @@ from stereoservo_drivers.detectors.kernel_types import (
 from stereoservo_drivers.detectors.patterns import SearchedFaces, find_faces
 
 SHRINK_FROM = 240
-"""Least side of an image [px] that is searched, not measured, at half its size: a third of the time, half
-the noise.
+"""Least side of an image [px] that is searched, but not measured, at half its size: a third of the time, half the
+noise.
 """
 GROW = 7
 """Pixels around a component's bounding box in the window that measures it."""
 MIN_FILL = 0.3
-"""Least part of its bounding box that a component covers (an ellipse of axes 1:4 on the diagonal: 0.37)."""
+"""Least part of its bounding box that a component fills (an ellipse of axes 1:4 on the diagonal: 0.37)."""
 MAX_ASPECT = 6.0
 
 
@@ -122,8 +122,8 @@ class Mask(NamedTuple):
 
 
 class SpotGates(NamedTuple):
-    """What a spot must be: of ``contrast`` [grey levels] at least, and no more ``lopsided``; and the ``most`` of them
-    that are wanted.
+    """Requirements for a spot: at least ``contrast`` [grey levels], at most ``lopsided``; and the largest number of
+    spots (``most``).
     """
 
     contrast: int
@@ -134,7 +134,7 @@ class SpotGates(NamedTuple):
 @kernel
 def _spots(picture, mask, gates, scratch):
     """Measurements (m, FIELDS) of the whole spots of a `Picture` among the components of a `Mask`, at most as many as
-    are wanted, the roundest first. All four are the fields of their records.
+    required, the roundest first. All four arguments are the fields of their records.
     """
     picture, mask, gates, scratch = Picture(*picture), Mask(*mask), SpotGates(*gates), Scratch(*scratch)
     size, columns, shrink = mask.pixels.size, mask.columns, mask.shrink
@@ -171,7 +171,7 @@ def _spots(picture, mask, gates, scratch):
 
 @kernel
 def _roundest(found, most):
-    """The first ``most`` rows of ``found`` (m, FIELDS) by their LOPSIDED, without those that are another one again."""
+    """The first ``most`` rows of ``found`` (m, FIELDS) by their LOPSIDED, without duplicates."""
     n = found.shape[0]
     order = np.empty(n, np.int64)
     for i in range(n):
@@ -221,7 +221,7 @@ def find_spots(
 
 
 def compile_kernels() -> None:
-    """Compile what the detector calls, or load it from the cache."""
+    """Compile the kernels that the detector calls, or load them from the cache."""
     compile_for(noise_level, IMAGE)
     compile_for(
         _spots,
@@ -236,19 +236,20 @@ Region = tuple[int, int, int, int]
 """Left, top, right, bottom [px]; right and bottom are the first beyond."""
 
 REACH_PX = 1.5
-"""How far a dot may lie from the homography of four others."""
+"""Largest distance of a dot from the homography of four others [px]."""
 MOST_COPIES = 3
 LOST_SPEED_PX_S = 200.0
-"""Standard deviation of a speed that a prior did not know of."""
+"""Standard deviation of a speed that is not in the prior [px/s]."""
 NEAR = 9.0
-"""Mean squared distance [prior variances] within which a copy of a face may be the one expected (chi-square of two
-degrees of freedom: 0.99)."""
+"""Mean squared distance [prior variances] within which a copy of a face may be the expected one (chi-square of two
+degrees of freedom: 0.99).
+"""
 FARTHER = 20.0
-"""How much farther [prior variances] the other copies must be."""
+"""Least additional distance [prior variances] of the other copies."""
 MARGIN_PX = 48.0
-"""Room about where dots are expected: their size, and background to judge them by."""
+"""Margin around expected dots [px]: their size, and background for comparison."""
 WORTH = 0.5
-"""Part of a picture from which a region is not searched on its own first."""
+"""Share of a picture above which a region is not searched separately first."""
 
 
 @dataclass(frozen=True)
@@ -269,10 +270,9 @@ class Expectation:
 
 
 def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) -> list[Expectation | None]:
-    """Expectation of each face of ``every_id`` (f, 7) at ``t_ns`` from a prior of any age; None where it is
-    unusable.
+    """Expectation of each face of ``every_id`` (f, 7) at ``t_ns`` from a prior of any age; None if it is unusable.
 
-    It is moved by its velocities for no longer than ``max_age_s``, and loosened by its whole age.
+    It is extrapolated by its velocities for at most ``max_age_s``, and its covariance grows with its whole age.
     """
     age_s = (t_ns - prior.t_ns) * 1e-9
     pixels = prior.pixels + prior.velocities * float(np.clip(age_s, -max_age_s, max_age_s))
@@ -288,7 +288,7 @@ def expectations(prior: Prior, t_ns: int, max_age_s: float, every_id: IntArray) 
 
 
 def region_of(expected: Sequence[Expectation | None], shape: tuple[int, ...]) -> Region | None:
-    """Region of an image (height, width) that must contain all of these; None where that is no smaller, or unknown."""
+    """Region of an image (height, width) that must contain all of these; None if it is no smaller, or unknown."""
     known = [one for one in expected if one is not None]
     if len(known) < len(expected) or not known:
         return None
@@ -311,8 +311,8 @@ def crop(image: ImageArray, region: Region) -> ImageArray:
 def copies_of(
     faces: SearchedFaces, sought: BoolArray, spots: FloatArray, least: int, tolerance: float
 ) -> list[IntArray]:
-    """All occurrences (k, 7) of each face that is ``sought`` (f,) among ``spots`` (m, FIELDS): rows of the spots, -1
-    for missing dots.
+    """All occurrences (k, 7) of each face of ``sought`` (f,) among ``spots`` (m, FIELDS): rows of the spots, -1 for
+    missing dots.
     """
     owners, counts = (
         np.empty((len(faces.radii), MOST_COPIES, 7), np.int64),
@@ -323,9 +323,9 @@ def copies_of(
 
 
 def choose(copies: IntArray, spots: FloatArray, expected: Expectation | None) -> IntArray | None:
-    """Of several occurrences of a face the expected one; None where there is none, or it is ambiguous.
+    """The expected one of several occurrences of a face; None if there is none, or it is ambiguous.
 
-    A single one is taken wherever it is: a prior does not decide against the picture.
+    A single one is accepted wherever it is: a prior does not overrule the picture.
     """
     if len(copies) < 2:
         return copies[0] if len(copies) else None

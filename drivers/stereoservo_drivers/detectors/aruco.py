@@ -38,18 +38,18 @@ from stereoservo_drivers.frame_images import SMALLEST_IMAGE, sized_image
 from stereoservo_drivers.options import invalid
 
 NOISY = 3.0
-"""Noise [grey levels] from which the image that is searched, not the one that is measured, is smoothed."""
+"""Noise [grey levels] above which the image is smoothed for the search, but not for the measurement."""
 SAME_TAG = 0.25
-"""Two finds of a tag nearer than this part of its side are one."""
+"""Two finds of a tag are the same if they are nearer than this share of its side."""
 ROOM_PX = 12.0
 ROOM = 0.35
-"""Room about a prior's tag in the window that is searched: pixels, and parts of the tag's size."""
+"""Margin around a prior's tag in the search window: pixels, and share of the tag's size."""
 MOST_WINDOWS = 0.5
-"""Where windows have more than this part of the image's pixels, the image is searched instead, once."""
+"""Share of the image's pixels in windows above which the whole image is searched instead, once."""
 LEAST_THRESHOLD_WINDOW, LARGEST_THRESHOLD_WINDOW = 5, 23
-"""Windows [px] of the adaptive thresholds, by steps of nine; the largest alone finds most tags."""
+"""Sizes [px] of the adaptive threshold's windows, in steps of nine; the largest alone finds most tags."""
 GATE_SIGMA, GATE_PX = 5.0, 3.0
-"""How far from its prior a corner may be for the prior to decide between two tags of one id."""
+"""Largest distance of a corner from its prior for the prior to decide between two tags of one id: sigmas, pixels."""
 Refinement = Literal["pattern", "subpixel", "apriltag", "none"]
 _METHODS = {
     "pattern": cv2.aruco.CORNER_REFINE_NONE,
@@ -58,9 +58,9 @@ _METHODS = {
     "none": cv2.aruco.CORNER_REFINE_NONE,
 }
 STATED_PX: dict[str, float] = {"pattern": 0.003, "subpixel": 0.25, "apriltag": 0.15, "none": 0.9}
-"""Standard deviation [px] that each refinement states, beside the noise's where that is known."""
+"""Standard deviation [px] of each refinement, in addition to the noise's if that is known."""
 APRILTAG_OFFSET = 0.5
-"""What CORNER_REFINE_APRILTAG adds to each coordinate: its pixels' centres lie at halves."""
+"""Offset that CORNER_REFINE_APRILTAG adds to each coordinate: its pixel centres are at halves."""
 Id = Annotated[int, Meta(ge=0, le=1_000_000_000)]
 
 
@@ -82,10 +82,10 @@ class TagOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     markers: tuple[TagMarkers, ...] = ()
     """Other ids for the corners of some of ``tags``."""
     refinement: Refinement = "pattern"
-    """How corners are made exact: ``pattern`` fits the whole printed tag; the others are OpenCV's."""
+    """Method of refining corners: ``pattern`` fits the whole printed tag; the others are OpenCV's."""
     floor_px: Annotated[float, Meta(ge=0)] | None = None
-    """Systematic standard deviation [px], part of every covariance: where residuals of ``pattern`` tell of misfit, that
-    counts as part of it. Default: that of the refinement.
+    """Systematic standard deviation [px], part of every covariance; a misfit found in residuals of ``pattern`` counts
+    as part of it. Default: that of the refinement.
     """
     image_size: tuple[int, int] | None = None
     """(width, height) [px] that frames must have; default: that of the first frame."""
@@ -105,15 +105,15 @@ class _Found:
 class TagDetector:
     """Detects corners of square tags with ids and covariances. One thread at a time.
 
-    A tag's identity is read from its cells in every image. With a fresh prior its pattern is fitted where it is
-    expected; where it is not there it is looked for in a window about that place; tags without a prior, and all when
-    none is found, in the whole image. Of a tag that is seen twice nothing is
-    reported, unless a prior is near one of the two and not the other. A tag that is not whole in the image, or of
-    which a cell does not show what the code says (refinement ``pattern``), is not reported. Ids are reported in
-    ascending order. The same frame and prior give the same observation.
+    A tag's identity is read from its cells in every image. With a fresh prior its pattern is fitted at the expected
+    place; if that fails, it is searched in a window around that place. Tags without a prior, and all tags if none is
+    found, are searched in the whole image. A tag that is seen twice is not reported, unless a prior is near only one of
+    the two. A tag that is not completely in the image, or with a cell that contradicts the code (refinement
+    ``pattern``), is not reported. Ids are reported in ascending order. The same frame and prior yield the same
+    observation.
 
-    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for
-    frames that are not what was announced. Content never raises.
+    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for frames that
+    differ from the announced ones. Content never raises.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -159,7 +159,7 @@ class TagDetector:
         return self._observation(frame, found)
 
     def _expected(self, frame: Frame, prior: Prior | None) -> dict[int, tuple[FloatArray, FloatArray]]:
-        """Expected corners of a tag by a fresh prior: pixels (4, 2) and standard deviations (4,) [px]."""
+        """Expected corners of a tag from a fresh prior: pixels (4, 2) and standard deviations (4,) [px]."""
         if prior is None or abs(frame.t_shutter_ns - prior.t_ns) * 1e-9 > self.options.max_prior_age_s:
             return {}
         dt_s = (frame.t_shutter_ns - prior.t_ns) * 1e-9
@@ -178,7 +178,7 @@ class TagDetector:
         return {tags[k]: (corners[k], sigmas[k]) for k in np.flatnonzero(inside)}
 
     def _found_at(self, image: ImageArray, expected: Mapping[int, tuple[FloatArray, FloatArray]]) -> dict[int, _Found]:
-        """Tags whose pattern is right where it is expected: no search, and no other tag of this id can be as near."""
+        """Tags whose pattern fits at the expected place: no search, and no other tag of this id can be as near."""
         found: dict[int, _Found] = {}
         if self.options.refinement != "pattern":
             return found
@@ -229,7 +229,7 @@ class TagDetector:
     def _quads(
         self, detector: cv2.aruco.ArucoDetector, image: ImageArray, tags: set[int]
     ) -> dict[int, list[FloatArray]]:
-        """Quadrilaterals (4, 2) [px] that OpenCV decodes as one of ``tags``."""
+        """Quadrilaterals (4, 2) [px] decoded by OpenCV as one of ``tags``."""
         image = np.ascontiguousarray(image)  # it may be a window
         searched = cv2.GaussianBlur(image, (5, 5), 1.0) if noise_level(image) > NOISY else image
         corners, ids, _ = detector.detectMarkers(searched)
@@ -264,7 +264,7 @@ class TagDetector:
             fit = register_tag(image, quad, self._cells[tag], blur_px)
             if fit is None or fit.contrast < self.options.min_contrast:
                 return None
-            # of misfit that the fit has seen, only what is less than the floor is added again
+            # of the misfit that the fit includes, only the remainder up to the floor is added
             return _Found(fit.corners, fit.covariances + max(variance - fit.misfit, 0.0) * np.eye(2))
         if self.options.refinement == "apriltag":
             quad = quad - APRILTAG_OFFSET
@@ -294,7 +294,7 @@ def _same(one: FloatArray, other: FloatArray) -> bool:
 
 
 def _window(image: ImageArray, corners: FloatArray, sigmas: FloatArray) -> tuple[ImageArray, FloatArray]:
-    """Part of an image about expected ``corners`` (4, 2), and its first pixel (2,)."""
+    """Part of an image around expected ``corners`` (4, 2), and its first pixel (2,)."""
     low, high = corners.min(axis=0), corners.max(axis=0)
     margin = ROOM * float((high - low).max()) + ROOM_PX + GATE_SIGMA * float(sigmas.max())
     height, width = image.shape
@@ -306,9 +306,9 @@ def _window(image: ImageArray, corners: FloatArray, sigmas: FloatArray) -> tuple
 def _opencv_detector(options: TagOptions, least_window: int) -> cv2.aruco.ArucoDetector:
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = _METHODS[options.refinement]
-    # what noise flips, the registration's own reading forgives; without it a tag must read as what it is
+    # the registration's own reading tolerates bits flipped by noise; without it the code must be exact
     parameters.errorCorrectionRate = 1.0 if options.refinement == "pattern" else 0.0
-    # as they come, the white margin's outline on a darker wall takes the place of the tag's: one in seven is lost
+    # by default, the white margin's outline on a darker wall replaces the tag's: one in seven is lost
     parameters.minMarkerDistanceRate = 0.02
     parameters.minGroupDistance = 0.05
     parameters.perspectiveRemoveIgnoredMarginPerCell = 0.25

@@ -86,25 +86,24 @@ from stereoservo_drivers.detectors.components import (
 from stereoservo_drivers.detectors.levels import RING, UNEVEN_INSIDE, inside, surroundings
 
 SKIRT = 2.2
-"""Distance to the ellipse, to first order, up to which a pixel outside counts [px] (in truth up to 2.8 at 4
-px radius).
+"""Distance to the ellipse, to first order, up to which a pixel outside counts [px] (actually up to 2.8 at 4 px radius).
 """
 NARROW = 1.3
-"""The same where another dot stands near."""
+"""The same if another dot is near."""
 NARROWEST = 0.8
-"""The same where one all but touches: enough to tell a face by, hardly to measure with."""
+"""The same if another dot almost touches: enough to identify a face, but hardly to measure."""
 CROWDED, PRESSED = 0.02, 0.1
-"""Standard deviations [px] that the light of a neighbour adds then."""
+"""Standard deviations [px] that are then added for the light of a neighbour."""
 ROOM = 7
-"""Pixels around a component's bounding box in its patch: a skirt and what gives background and noise."""
+"""Pixels around a component's bounding box in its patch: a skirt, and the surroundings for background and noise."""
 MARGIN = 4
 """Pixels needed between a dot's half-contrast outline and the border of the image."""
 
 
 @reassociating_kernel
 def _soft_moments(pixels, cx, cy, half, scale):
-    """Moments 1, x, y, x², xy, y² about (cx, cy) of the levels, times ``scale`` less a half and cut off at 0 and 1, no
-    farther than ``half`` in x.
+    """Moments 1, x, y, x², xy, y² about (cx, cy) of the levels, times ``scale`` minus a half and clipped to 0 and 1,
+    within ``half`` in x.
     """
     level, xs, ys = pixels
     s = su = sv = suu = suv = svv = F(0.0)
@@ -123,11 +122,11 @@ def _soft_moments(pixels, cx, cy, half, scale):
 
 @kernel
 def _ellipse(component, patch, planes, contrast, out):
-    """Soft area, centre and ellipse matrix of what is within 2 px of a component's bounding box into ``out``. False
-    where no ellipse can be had.
+    """Write to ``out`` the soft area, centre and ellipse matrix of the pixels within 2 px of a component's bounding
+    box. Returns False if no ellipse can be fitted.
     """
     a, b = lanes(patch, component.top - 2, component.bottom + 2)
-    # about the middle of the box: sums of small numbers
+    # about the centre of the box: sums of small numbers
     mid_u, mid_v = 0.5 * (component.left + component.right), 0.5 * (component.top + component.bottom)
     half = 0.5 * (component.right - component.left) + 2.0
     s, su, sv, suu, suv, svv = _soft_moments(
@@ -141,7 +140,7 @@ def _ellipse(component, patch, planes, contrast, out):
         return False
     mu = su / s
     mv = sv / s
-    # 1/12: the pixel's own spread
+    # 1/12: variance of the pixel itself
     mxx = max(suu / s - mu * mu - 1.0 / 12.0, 0.05)
     myy = max(svv / s - mv * mv - 1.0 / 12.0, 0.05)
     mxy = suv / s - mu * mv
@@ -171,7 +170,7 @@ def smaller_half_axis(q11, q12, q22):
 
 @kernel
 def _reach(q11, q12, q22, skirt):
-    """How far the window extends outside the ellipse [px], where the distance to first order is ``skirt``."""
+    """Largest distance of the window from the ellipse [px], if the distance to first order is ``skirt``."""
     thin = smaller_half_axis(q11, q12, q22)
     return skirt + np.sqrt(skirt * skirt + thin * thin) - thin
 
@@ -276,7 +275,7 @@ def single_ellipse(patch, skirt, out):
 
 
 class Window(NamedTuple):
-    """First and last column and row [px] of what counts about a centre."""
+    """First and last column and row [px] of the pixels that count around a centre."""
 
     left: int
     right: int
@@ -301,7 +300,7 @@ def _window(skirt, out):
 
 @kernel
 def _around(skirt, out):
-    """First and last column and row of what gives background and noise about the centre in ``out``."""
+    """First and last column and row of the pixels for background and noise around the centre in ``out``."""
     reach = _reach(out[QXX], out[QXY], out[QYY], skirt) + RING
     half_u, half_v = half_sizes(out[QXX], out[QXY], out[QYY])
     half_u, half_v = half_u + reach, half_v + reach
@@ -320,7 +319,9 @@ def _beset(labels, box, label, near, out):
 
 @kernel
 def _free_skirt(labels, box, label, out):
-    """The widest skirt [px] that no neighbour reaches into, 0 for none; the standard deviation [px] that one adds."""
+    """The widest skirt [px] without a neighbour inside, 0 for none; and the standard deviation [px] that a neighbour
+    adds.
+    """
     if not _beset(labels, box, label, SKIRT + 1.0, out):
         return SKIRT, 0.0
     if not _beset(labels, box, label, NARROW + 1.0, out):
@@ -331,8 +332,8 @@ def _free_skirt(labels, box, label, out):
 
 
 class Dot(NamedTuple):
-    """A dot's ``background`` level, the median distance from it (``noise``), ``contrast`` to it, and ``skirt`` [px];
-    what a neighbour adds, ``beside`` [px].
+    """A dot's ``background`` level, the median distance from it (``noise``), ``contrast`` to it, ``skirt`` [px], and
+    the standard deviation added by a neighbour, ``beside`` [px].
     """
 
     background: float
@@ -344,7 +345,7 @@ class Dot(NamedTuple):
 
 @kernel
 def _find_dot(picture, box, sought, scratch, out):
-    """Status, the dot that is ``sought`` and the patch about it; its ellipse and its centre to first order into
+    """Status, the dot that is ``sought`` and the patch around it; writes its ellipse and its centre to first order into
     ``out``.
     """
     dark, min_contrast = picture.dark, sought.contrast
@@ -432,7 +433,9 @@ def _congruence(A, N):
 
 @kernel
 def _sensitivities(j, weights, contrast, out):
-    """Into ``out``: the centre's covariance at unit noise, its shifts by slopes of the light and of the background."""
+    """Write to ``out`` the centre's covariance at unit noise, and its shifts by slopes of the light and of the
+    background.
+    """
     _, wxx, wxy, wyy, _, wwxx, wwxy, wwyy, lxx, lxy, lyy, wlxx, wlxy, wlyy = weights
     det = j[0] * j[3] - j[1] * j[2]
     inverse = Matrix2(j[3] / det, -j[1] / det, -j[2] / det, j[0] / det)
@@ -448,7 +451,7 @@ def _sensitivities(j, weights, contrast, out):
         out[LIT + 2 * k + 1] = -(p * lxy + r * lyy)
         out[DARK + 2 * k] = -(p * wxx + r * wxy)
         out[DARK + 2 * k + 1] = -(p * wxy + r * wyy)
-        # inside the dot T = d is one of the terms that the slope is fitted with
+        # inside the dot T = d is one of the terms fitted together with the slope
         out[PULL + 2 * k] = -f * p
         out[PULL + 2 * k + 1] = -f * r
 
@@ -457,7 +460,7 @@ def _sensitivities(j, weights, contrast, out):
 def measure(picture, window, sought, scratch, out):
     """Measure the dot that is ``sought`` in a window, (u0, v0, u1, v1) for [u0, u1) x [v0, v1), of a `Picture`.
 
-    ``out`` (FIELDS,) is written; returns a status, ``OK`` or why not.
+    Writes ``out`` (FIELDS,); returns a status, ``OK`` or the reason of the failure.
     """
     rows, columns = picture.image.shape
     u0, v0, u1, v1 = window
@@ -498,8 +501,8 @@ def measure(picture, window, sought, scratch, out):
 
 
 class DotWindows(NamedTuple):
-    """Where k dots are looked for: ``boxes`` (k, 4) as :func:`measure` takes them, the points ``near`` (k, 2) [px]
-    which they are near to, and the ``least`` (k,) pixels that they have.
+    """Windows in which k dots are searched: ``boxes`` (k, 4) as in :func:`measure`, the points ``near`` (k, 2) [px]
+    that they are near to, and their ``least`` (k,) numbers of pixels.
     """
 
     boxes: IntArray
@@ -523,17 +526,18 @@ def measure_windows(picture, windows, min_contrast, scratch, out, status):
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
 CLEARLY_MORE = 1.25
-"""Ratio from which the noise in the light is taken for more than in the dark: three standard deviations of a median
-over fourteen dots of 35 pixels each."""
+"""Ratio above which the noise in bright pixels is considered larger than in dark ones: three standard deviations of a
+median over fourteen dots of 35 pixels each.
+"""
 SATURATED_PX = 0.005
-"""Standard deviation [px] that sampling adds to a dot whose edge is cut off at white (measured: 0.0045)."""
+"""Standard deviation [px] that sampling adds to a dot with its edge clipped at white (measured: 0.0045)."""
 
 
 @kernel
 def variances(seen, contrasts, unevenness, out):
-    """Noise variance of each dot (k,) [levels²] from what is ``seen`` (k,), -1 where that is nothing.
+    """Noise variance of each dot (k,) [levels²] from ``seen`` (k,), which is -1 where nothing was measured.
 
-    ``unevenness``: part of the ``contrasts`` (k,) that is no noise. One picture has one noise: each dot gets the
+    ``unevenness``: part of the ``contrasts`` (k,) that is not noise. One picture has one noise: each dot gets the
     median over all of them, which is steadier (a dot's own: 15 %), unless its own is more than twice that.
     """
     n = seen.size
@@ -565,8 +569,8 @@ def variances(seen, contrasts, unevenness, out):
 def covariances(dots, floor, out):
     """Covariances (k, 2, 2) [px²] of measured ``dots`` (k, FIELDS), with a standard deviation of ``floor`` [px] added.
 
-    Noise may be more in the light than in the dark (shot noise). Where levels are cut off at black that of the light
-    counts; less noise in the light than in the dark is none seen, for being cut off at white.
+    Noise may be larger in bright pixels than in dark ones (shot noise). If levels are clipped at black, the noise of
+    the bright pixels is used; noise that is smaller in bright pixels is clipped at white, and counts as unmeasured.
     """
     n = dots.shape[0]
     darks, brights = np.empty(n), np.empty(n)
@@ -579,7 +583,7 @@ def covariances(dots, floor, out):
         dot, dark = dots[i], darks[i]
         bright = brights[i] if seen and brights[i] > CLEARLY_MORE * dark else dark
         clip = 3.0 * np.sqrt(bright)
-        # noise that is cut off is less: 0.58 of it at black itself, 0.85 one standard deviation above
+        # clipped noise is smaller: 0.58 of it at black itself, 0.85 one standard deviation above
         if dot[BACKGROUND] < 2.5 * np.sqrt(dark):
             dark = bright
         even = floor * floor

@@ -11,20 +11,21 @@ from stereoservo.numerics.compilation import kernel
 
 F = np.float32
 NOTHING = F(1e-12)
-"""Keeps quotients finite in the centre of an ellipse."""
+"""Keeps quotients finite at the centre of an ellipse."""
 MAX_WINDOW = 160
 """Largest side of a window [px]."""
 ROW, FIRST, BEYOND, COMPONENT = range(4)
-"""Columns of a run: its row, its first pixel, the first beyond, the number of its component."""
+"""Columns of a run: its row, its first pixel, one past its last, the number of its component."""
 AREA_PX, SUM_U, SUM_V, LEFT, RIGHT, TOP, BOTTOM = range(7)
-"""Columns of a component's totals; the last row and column are its own."""
+"""Columns of a component's totals; the last row and column are inclusive."""
 LEVEL, VALID, X, Y = range(4)
-"""Planes of a patch: level above the background, 1 where that is a pixel of the image, column, row."""
+"""Planes of a patch: level above the background, 1 for a pixel inside the image, column, row."""
 LANES = 32
-"""Pixels of a patch are so many at a time: what the loops over them leave over is padding."""
+"""Patches are padded to a multiple of this number of pixels, for the loops over them."""
 FAR = 10
-"""Pixels between the bounding boxes of components from which one does not matter to a dot in the other: twice what
-must be free about it, and what its ellipse may exceed its box by."""
+"""Distance [px] of the bounding boxes of components above which one does not affect a dot in the other: twice the
+required free distance, plus the excess of its ellipse over its box.
+"""
 PATCH = (MAX_WINDOW + 96) ** 2
 """Pixels of the largest patch, padding included."""
 
@@ -37,8 +38,8 @@ class Picture(NamedTuple):
 
 
 class Sought(NamedTuple):
-    """The dot that is looked for: the one nearest to (``u``, ``v``) [px], of ``contrast`` [grey levels] and ``area``
-    [pixels] at least.
+    """The dot to find: the one nearest to (``u``, ``v``) [px], of at least ``contrast`` [grey levels] and ``area``
+    [pixels].
     """
 
     u: float
@@ -48,7 +49,7 @@ class Sought(NamedTuple):
 
 
 class Pixels(NamedTuple):
-    """Pixels of a patch (n,): ``level`` above the background, column ``x`` and row ``y`` [px] from the patch's own."""
+    """Pixels of a patch (n,): ``level`` above the background, column ``x`` and row ``y`` [px] from its origin."""
 
     level: npt.NDArray[np.float32]
     x: npt.NDArray[np.float32]
@@ -91,8 +92,8 @@ def scratch() -> Scratch:
 
 @kernel
 def extremes(picture, box, brightest):
-    """Lowest and highest level of a window; ``brightest`` (rows,) gets that of each row, of inverted levels where dots
-    are dark.
+    """Lowest and highest level of a window. Writes the highest of each row to ``brightest`` (rows,); levels are
+    inverted if dots are dark.
     """
     image, dark = picture
     u0, v0, u1, v1 = box
@@ -112,9 +113,9 @@ def extremes(picture, box, brightest):
 
 @kernel
 def join_runs(runs, count, reach):
-    """Number the components of ``count`` runs (n, 4) in the order of their rows; their totals (components, 7).
+    """Number the components of ``count`` runs (n, 4) in the order of their rows; returns their totals (components, 7).
 
-    Runs of neighbouring rows are of one component where they overlap, or, at a ``reach`` of 1, touch by a corner.
+    Runs of neighbouring rows belong to one component if they overlap, or, with a ``reach`` of 1, touch by a corner.
     """
     components = count
     above = 0
@@ -144,7 +145,7 @@ def join_runs(runs, count, reach):
             total = totals[mine]
             total[LEFT], total[RIGHT], total[TOP] = first, beyond - 1, row
         else:
-            # an earlier run, which has its number already
+            # an earlier run, which already has its number
             mine = runs[runs[k, COMPONENT], COMPONENT]
             total = totals[mine]
         runs[k, COMPONENT] = mine
@@ -167,7 +168,7 @@ class Threshold(NamedTuple):
 
 @kernel
 def _bright_runs(picture, box, threshold, runs):
-    """Runs (n, 4) of pixels at the threshold or above in a window; their number."""
+    """Runs (n, 4) of pixels at or above the threshold in a window; returns their number."""
     image, dark = picture
     level, brightest = threshold
     u0, v0, u1, v1 = box
@@ -195,8 +196,8 @@ def _bright_runs(picture, box, threshold, runs):
 
 
 class Component(NamedTuple):
-    """A component of a window: its ``label`` (0: none), the ``gap`` [px] to the next one's bounding box, its own, and
-    sum of levels and number of its inner pixels.
+    """A component of a window: its ``label`` (0: none), the ``gap`` [px] to the next one's bounding box, its own
+    bounding box, and sum of levels and number of its inner pixels.
     """
 
     label: int
@@ -211,7 +212,7 @@ class Component(NamedTuple):
 
 @kernel
 def _gap(totals, which):
-    """Pixels between the bounding box of a component and the nearest other one's; FAR where there is none nearer."""
+    """Distance [px] between the bounding boxes of a component and the nearest other one; FAR if none is nearer."""
     own = totals[which]
     gap = FAR
     for c in range(totals.shape[0]):
@@ -226,8 +227,8 @@ def _gap(totals, which):
 def nearest_component(picture, box, threshold, sought, scratch):
     """The bright component that is ``sought``, by place and area.
 
-    Those that touch the window's rim are something larger than a dot and are not looked for. Labels are written where
-    another one is near.
+    Components that touch the window's border are larger than a dot and are ignored. Labels are written if another
+    component is near.
     """
     image, dark = picture
     u0, v0, u1, v1 = box
@@ -309,12 +310,12 @@ def half_sizes(q11, q12, q22):
 
 @kernel
 def patch_size(box):
-    """Pixels of the planes that a rectangle takes, with its padding."""
+    """Number of pixels of a rectangle in the planes, including its padding."""
     return ((box[2] - box[0]) // 8 * 8 + 8) * (box[3] - box[1] + 1) + 2 * LANES
 
 
 class Patch(NamedTuple):
-    """Where the pixels of a patch come from: first and last columns and rows [px]; its ``width``, a multiple of 8."""
+    """Source of the pixels of a patch: first and last columns and rows [px]; its ``width``, a multiple of 8."""
 
     left: int
     top: int
@@ -325,9 +326,9 @@ class Patch(NamedTuple):
 
 @kernel
 def fill_patch(picture, background, box, planes):
-    """The pixels of a rectangle, its last row and column included, into ``planes`` (4, n), row by row.
+    """Write the pixels of a rectangle, including its last row and column, into ``planes`` (4, n), row by row.
 
-    What is outside of the image or pads a row has the level 0 and is not VALID; what pads the end is far away.
+    A pixel outside of the image, or padding a row, has the level 0 and is not VALID; padding at the end is far away.
     """
     image, dark = picture
     u0, v0, u1, v1 = box
@@ -362,7 +363,7 @@ def fill_patch(picture, background, box, planes):
 
 @kernel
 def blank_others(box, label, patch, scratch):
-    """Give the pixels of other components than ``label`` in a window the background's level in their patch."""
+    """Set the pixels of components other than ``label`` in a window to the background's level in their patch."""
     labels, _, planes = scratch
     u0, v0, u1, v1 = box
     for v in range(max(patch.top, v0), min(patch.bottom + 1, v1)):
@@ -373,7 +374,7 @@ def blank_others(box, label, patch, scratch):
 
 @kernel
 def lanes(patch, first, last):
-    """First and end in the planes of the rows ``first`` to ``last`` [px] of a patch, a multiple of LANES apart."""
+    """First index and end in the planes of the rows ``first`` to ``last`` [px] of a patch, multiples of LANES apart."""
     start = (first - patch.top) * patch.width
     n = (last - first + 1) * patch.width
     return start, start + (n + LANES - 1) // LANES * LANES
@@ -382,7 +383,8 @@ def lanes(patch, first, last):
 @kernel
 def crowded(labels, box, label, near, reach, out):
     """Whether more than specks (noise on the dot's own edge) of other components come within ``near`` [px], to first
-    order, of the ellipse of ``out``; ``reach`` [px] how far that is at most."""
+    order, of the ellipse of ``out``; ``reach`` [px]: largest extent of that.
+    """
     specks = 3
     q11, q12, q22 = out[QXX], out[QXY], out[QYY]
     wide, high = half_sizes(q11, q12, q22)

@@ -1,9 +1,9 @@
 """Detector of natural features: learnt landmarks, found by keypoints, tracked, and registered to their reference in
 every frame.
 
-Tracks that go from frame to frame only add up their errors (thesis 4.5: 0.3 px between consecutive images, "otherwise
-a noticeable drift"). Here optical flow only gives start values: what is reported is the alignment of the reference
-patch with this frame, whose error does not depend on how many frames there were before.
+Tracks from frame to frame accumulate their errors (thesis 4.5: 0.3 px between consecutive images, "otherwise a
+noticeable drift"). Here optical flow provides only start values: the reported position is the alignment of the
+reference patch with this frame, whose error does not depend on the number of previous frames.
 """
 
 from __future__ import annotations
@@ -46,15 +46,19 @@ from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
 FLOW_BACK_PX = 0.7
-"""How far flow there and back may end from where it began."""
+"""Largest distance from the start after forward and backward flow [px]."""
 PULL = 0.1
-"""Share by which a track's warp is pulled to that of its neighbours a frame: what the patch itself leaves open."""
+"""Share by which a track's warp is pulled to that of its neighbours per frame, for the part that the patch itself does
+not determine.
+"""
 OFF_PX = 5.0
-"""How far a landmark that was not tracked may be found from where prior or neighbours have it, beside their sigmas."""
+"""Largest distance [px], in addition to the sigmas, of an untracked landmark from its place predicted by prior or
+neighbours.
+"""
 OFF_SIGMAS = 4.0
 REFERENCE_TILTS = 1
 KEYPOINTS = 600
-"""Of the image, and of each view of the reference."""
+"""Number of keypoints of the image, and of each view of the reference."""
 Positive = Annotated[float, Meta(gt=0)]
 
 
@@ -66,20 +70,20 @@ class CornerOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     window: Annotated[int, Meta(ge=4, le=30)] = 10
     """Half the side of the patches [px]."""
     levels: Annotated[int, Meta(ge=1, le=6)] = 4
-    """Levels of the pyramid in which flow and patches are looked for."""
+    """Levels of the pyramid in which flow and patches are computed."""
     max_residual: Annotated[float, Meta(gt=0, le=1)] = 0.5
-    """Largest rms difference of a patch from its reference, as a share of its contrast, gain and offset taken out."""
+    """Largest rms difference of a patch from its reference, as a share of its contrast, without gain and offset."""
     min_landmarks: Annotated[int, Meta(ge=5, le=100)] = 6
-    """Landmarks of the tool, or of the scene, that must hang together to be reported."""
+    """Least number of landmarks of the tool, or of the scene, that must be consistent to be reported."""
     radius_px: Positive = 60.0
-    """About a landmark, in the reference, where keypoints speak for it at acquisition."""
+    """Radius around a landmark, in the reference, of the keypoints used at acquisition."""
     max_gap_s: Positive = 0.5
-    """Tracks older than this are forgotten."""
+    """Age after which tracks are dropped."""
     max_prior_age_s: Positive = 0.25
     search_every: Annotated[int, Meta(ge=1)] = 10
-    """Frames from one search of the whole image to the next, while only a part of the landmarks is lost."""
+    """Number of frames between searches of the whole image, while only a part of the landmarks is lost."""
     floor_px: Annotated[float, Meta(ge=0)] = 0.02
-    """Systematic standard deviation [px], part of every covariance: interpolation, and surfaces that bend."""
+    """Systematic standard deviation [px], part of every covariance: interpolation, and curved surfaces."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +99,9 @@ class _Track:
 class CornerDetector:
     """Detects the landmarks of one camera. One thread at a time.
 
-    It remembers the last frame, and forgets it where the sequence goes back or time has passed: the same *series* of
-    frames and priors gives the same observations. A landmark is reported where its reference patch is found, looks
-    alike, and hangs together with others of its kind; ids are reported in ascending order.
+    It stores the last frame, and drops it if the sequence goes back or is interrupted: the same *series* of frames and
+    priors yields the same observations. A landmark is reported if its reference patch is found, is similar, and is
+    consistent with others of its kind; ids are reported in ascending order.
 
     Raises DriverError: ``option``, ``landmarks`` at construction; ``image_format``, ``image_size`` by :meth:`detect`
     for frames that are not like the reference. Content never raises.
@@ -172,7 +176,7 @@ class CornerDetector:
                 size=(width, height),
                 expected=(w, h),
             )
-        return image.copy()  # kept for the next frame; a caller may use its buffer again
+        return image.copy()  # stored for the next frame; a caller may reuse its buffer
 
     def _usable_track(self, frame: Frame) -> _Track | None:
         track = self._track
@@ -227,7 +231,7 @@ class CornerDetector:
         rows, where = rows[ok], there[ok].astype(np.float64)
         if len(rows):
             self._anchor(pyramid, track, rows, where, found)
-        # Flow takes a lamp that is switched on for motion; patches do not.
+        # Flow mistakes a lamp that is switched on for motion; patches do not.
         lost = ~found.found[tracked]
         none = np.zeros(int(lost.sum()))
         self._seek_near(pyramid, tracked[lost], track.found.A[tracked[lost]], expectations[lost], none, found)
@@ -281,7 +285,7 @@ class CornerDetector:
         found.found[:] = rigid | free
 
     def _search(self, image: ImageArray, pyramid: list[ImageArray], found: Alignment) -> None:
-        """Search for kinds of which nothing is found: at their reference positions, then anywhere by keypoints."""
+        """Search for kinds without any found landmark: at their reference positions, then anywhere by keypoints."""
         kinds = [kind for kind in np.unique(self._kinds) if not found.found[self._kinds == kind].any()]
         self._since_search += 1
         if not kinds:
@@ -313,7 +317,7 @@ class CornerDetector:
         return result
 
     def _merge(self, found: Alignment, other: Alignment, missing: BoolArray) -> None:
-        """Take from ``other`` those ``missing`` landmarks that are mutually consistent, and further ones of their
+        """Copy from ``other`` the ``missing`` landmarks that are mutually consistent, and further ones of their
         neighbourhood.
         """
         other.found[:] &= missing

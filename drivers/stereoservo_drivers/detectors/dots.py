@@ -66,7 +66,7 @@ from stereoservo_drivers.detectors.patterns import SearchedFaces, basis_inverse
 from stereoservo_drivers.frame_images import sized_image
 
 SAME_SPOT_PX = 2.0
-"""A spot this near to a dot that was tracked is that dot."""
+"""A spot this near to a tracked dot is the same dot."""
 
 
 class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -77,8 +77,8 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     faces: tuple[FaceOptions, ...] | None = None
     """Default: the two faces of the default marker body."""
     beside: tuple[str | FaceOptions, ...] = ()
-    """Faces beside the body, such as a workpiece's: names of printed ones or custom faces. No prior contains
-    where they are, so that every image is searched for them.
+    """Faces besides the body, such as a workpiece's: names of printed ones or custom faces. No prior contains their
+    positions, so that every image is searched for them.
     """
     image_size: tuple[int, int] | None = None
     """(width, height) [px] that frames must have; default: that of the first frame."""
@@ -86,25 +86,26 @@ class DotOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     min_contrast: Annotated[int, Meta(ge=5, le=250)] = 30
     """Least difference of a dot from its background [grey levels]."""
     min_dots: Annotated[int, Meta(ge=1)] = 4
-    """Tracking that finds fewer dots gives way to acquisition."""
+    """Number of found dots below which tracking is replaced by acquisition."""
     acquire_dots: Annotated[int, Meta(ge=6, le=7)] = 6
     """Dots of a face that acquisition must find."""
     consistency_px: Positive = 0.3
-    """How far a dot may lie from its face's homography [px]: print and lens errors, not noise."""
+    """Largest distance of a dot from its face's homography [px]: print and lens errors, not noise."""
     gate_probability: Annotated[float, Meta(ge=0, lt=1)] = 0.0
-    """Refuse tracked dots so far off their prior that only 1 - this of good ones are (chi-square of two degrees of
-    freedom; covariance of prior and measurement); 0: leave it to the core, which can tell what moved.
+    """Significance level at which tracked dots are refused for their distance from the prior: good ones exceed it with
+    probability 1 - this (chi-square of two degrees of freedom; covariance of prior and measurement); 0: leave it to the
+    core, which can determine what moved.
     """
     lopsided: Positive = 0.02
     """Largest odd harmonic of a whole dot's edge; a cut of 0.5 px makes 0.02, of 1 px 0.04."""
     floor_px: Annotated[float, Meta(ge=0)] = 0.001
     """Systematic standard deviation [px], part of every covariance: sampling of sharp edges and rounding to grey
-    levels. The default is what residuals of calibrations have beyond the scatter of frames at 2 grey levels of
-    noise (tests/sim/test_demo.py holds the pooled chi-square); noise-free images, whose rounding nothing
-    dithers, have 0.0013.
+    levels. The default is the excess of calibration residuals over the scatter of frames at 2 grey levels of noise
+    (tests/sim/test_demo.py has the pooled chi-square); noise-free images, with rounding that nothing dithers, have
+    0.0013.
     """
     max_spots: Annotated[int, Meta(ge=7, le=100)] = 48
-    """Dot-like spots that acquisition looks at, the roundest first."""
+    """Largest number of dot-like spots that acquisition examines, the roundest first."""
 
 
 _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
@@ -112,7 +113,7 @@ _Found = tuple[FloatArray, npt.NDArray[np.bool_]]
 
 
 class _Seen(NamedTuple):
-    """What an observation is made of: arrays of its own, of which the first rows are filled."""
+    """Data of an observation: arrays of its own, with the first rows filled."""
 
     ids: IntArray
     pixels: FloatArray
@@ -123,7 +124,7 @@ class _Seen(NamedTuple):
         return cls(np.empty(most, np.int64), np.empty((most, 2)), np.empty((most, 2, 2)))
 
     def observation(self, frame: Frame, count: int) -> CameraObservation:
-        """That of a ``frame``, of the first ``count`` rows."""
+        """The observation of a ``frame``, from the first ``count`` rows."""
         return CameraObservation(
             frame.camera,
             frame.seq,
@@ -138,14 +139,13 @@ class _Seen(NamedTuple):
 class DotDetector:
     """Detects dots of self-identifying faces: ids, centres and calibrated covariances. One thread at a time.
 
-    With a fresh prior the dots are measured in windows; otherwise, or when fewer than ``min_dots`` are
-    found, the whole image is searched and every face identified on its own. Faces ``beside`` the body, which the prior
-    does not know, are searched for in the whole image. A face with fewer than four
-    accepted dots is not reported: fewer cannot be checked. Ids are reported in ascending order. The same
-    frame and prior give the same observation.
+    With a fresh prior the dots are measured in windows; otherwise, or if fewer than ``min_dots`` are found, the whole
+    image is searched and every face identified independently. Faces ``beside`` the body, which are not in the prior,
+    are searched for in the whole image. A face with fewer than four accepted dots is not reported: fewer cannot be
+    checked. Ids are reported in ascending order. The same frame and prior yield the same observation.
 
-    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for
-    frames that are not what was announced. Content never raises.
+    Raises DriverError: ``option`` at construction; ``image_format``, ``image_size`` by :meth:`detect` for frames that
+    differ from the announced ones. Content never raises.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -220,7 +220,9 @@ class DotDetector:
         return len(prior.ids) > 0 and age_s <= self.options.max_prior_age_s
 
     def _track(self, image: ImageArray, prior: Prior, dt_s: float, seen: _Seen) -> int:
-        """Measure and judge the dots of a prior, into ``seen`` and for :meth:`_with_others`; the number accepted."""
+        """Measure and check the dots of a prior, writing to ``seen`` and for :meth:`_with_others`; returns the number
+        accepted.
+        """
         options = self.options
         expected = (
             np.ascontiguousarray(prior.ids, np.int64),
@@ -297,7 +299,7 @@ class DotDetector:
 MIN_HALF_WINDOW = 14
 MAX_HALF_WINDOW = 64
 SHAPE_MARGIN = 6
-"""Pixels between a dot's expected outline and the rim of its window, beside the prior's uncertainty."""
+"""Pixels between a dot's expected outline and the border of its window, in addition to the prior's uncertainty."""
 
 
 class FaceDots(NamedTuple):
@@ -321,8 +323,8 @@ class PriorDots(NamedTuple):
 
 
 class ExpectedDots(NamedTuple):
-    """What a prior says of the m dots of all faces, where ``present`` (m,): ``predicted`` (m, 2) [px] with covariances
-    ``spread`` (m, 3), xx, xy, yy [px²], and the ``shapes`` (m, SHAPE) of their images.
+    """Prior of the m dots of all faces, where ``present`` (m,): ``predicted`` (m, 2) [px] with covariances ``spread``
+    (m, 3), xx, xy, yy [px²], and the ``shapes`` (m, SHAPE) of their images.
     """
 
     predicted: FloatArray
@@ -332,9 +334,10 @@ class ExpectedDots(NamedTuple):
 
 
 class TrackGates(NamedTuple):
-    """What a tracked dot must be: of ``contrast`` [grey levels] at least; ``limit``, infinite for none: the largest
+    """Requirements for a tracked dot: at least ``contrast`` [grey levels]; ``limit``, infinite for none: the largest
     squared distance from its prior in covariances of prior and measurement; ``lopsided``, ``tolerance`` [px] as in the
-    options. ``floor`` [px]: standard deviation that is part of every covariance.
+    options.
+    ``floor`` [px]: standard deviation that is part of every covariance.
     """
 
     contrast: int
@@ -346,10 +349,10 @@ class TrackGates(NamedTuple):
 
 @kernel
 def expect(face_dots, prior, expected, windows):
-    """`DotWindows` for the dots of a prior, into ``windows``, and what it says of them, into ``expected``.
+    """Write the `DotWindows` for the dots of a prior to ``windows``, and their expected properties to ``expected``.
 
-    Faces that the prior shows from behind, too thin, too uncertain or by fewer than four dots stay empty. Returns the
-    number of windows.
+    Faces that the prior shows from behind, too thin, too uncertain or with fewer than four dots remain empty. Returns
+    the number of windows.
     """
     every_id, patterns, radii = face_dots
     ids, pixels, velocities, covariances, dt_s = prior
@@ -401,7 +404,7 @@ def expect(face_dots, prior, expected, windows):
 
 @kernel
 def _gate(expected, status, gates, dots, used):
-    """Gates of each dot of a face, by itself and relative to its neighbours, into ``used`` (n,)."""
+    """Write to ``used`` (n,) which dots of a face pass the gates, individually and relative to their neighbours."""
     predicted, present, spread, shapes = expected
     limit, lopsided = gates.limit, gates.lopsided
     n = used.size
@@ -433,8 +436,8 @@ def _gate(expected, status, gates, dots, used):
 
 @kernel
 def judge(face_dots, expected, status, gates, dots, used):
-    """Accept measured dots: complete, of the expected size, similar, nearest to their own prediction, consistent
-    with the face.
+    """Accept measured dots: complete, of the expected size, similar, nearest to their own prediction, consistent with
+    the face.
 
     Moves ``dots`` (m, FIELDS) to the dots' centres, writes ``used`` (m,). Returns their number.
     """
@@ -468,8 +471,9 @@ def judge(face_dots, expected, status, gates, dots, used):
 
 @kernel
 def report(every_id, order, dots, used, floor, seen):
-    """What is ``used`` (m,) of ``dots`` (m, FIELDS) as an observation, by ascending id, into the first rows of ``seen``
-    (the fields of a `_Seen`); their number. ``order`` (m,) sorts the ids of all faces (f, n); ``floor`` [px].
+    """Write the dots of ``used`` (m,) of ``dots`` (m, FIELDS) as an observation, by ascending id, into the first rows
+    of ``seen`` (the fields of a `_Seen`); returns their number. ``order`` (m,) sorts the ids of all faces (f, n);
+    ``floor`` [px].
     """
     ids, pixels, covariances = seen
     n = every_id.shape[1]
@@ -488,11 +492,12 @@ def report(every_id, order, dots, used, floor, seen):
 
 @kernel
 def track(picture, faces, prior, gates, scratch, found):
-    """From an image and a prior to an observation: :func:`expect`, the measurement in windows, :func:`judge`,
+    """Compute an observation from an image and a prior: :func:`expect`, the measurement in windows, :func:`judge`,
     :func:`report`. Returns the number of dots.
 
-    All are the fields of their records, `Picture`, `FaceDots` and the order of all their ids (m,), `PriorDots`,
-    `TrackGates`, `Scratch`; ``found``: dots (m, FIELDS) and used (m,), which are written, then those of a `_Seen`.
+    All arguments are the fields of their records, `Picture`, `FaceDots` and the order of all their ids (m,),
+    `PriorDots`, `TrackGates`, `Scratch`; ``found``: dots (m, FIELDS) and used (m,), which are written, then those of a
+    `_Seen`.
     """
     picture, prior, gates = Picture(*picture), PriorDots(*prior), TrackGates(*gates)
     every_id, patterns, radii, order = faces
@@ -514,9 +519,9 @@ def track(picture, faces, prior, gates, scratch, found):
 def settle_faces(face_dots, spots, owners, checks, dots, used):
     """Check the faces (f, n) that acquisition found: ``owners`` are rows of ``spots``, -1 for missing dots.
 
-    ``face_dots``: the fields of a `FaceDots`; ``checks``: how far [px] a dot may lie from its face's homography, and
-    the least dots of a face. Of faces that share a spot the one with more dots stays; of equals, none. Writes ``dots``
-    (f, n, FIELDS) and ``used`` (f, n), of zeros.
+    ``face_dots``: the fields of a `FaceDots`; ``checks``: the largest distance [px] of a dot from its face's
+    homography, and the least number of dots of a face. Of faces that share a spot the one with more dots is kept; of
+    equals, none. Writes ``dots`` (f, n, FIELDS) and ``used`` (f, n), which are zero before.
     """
     _, patterns, radii = face_dots
     tolerance, least = checks
@@ -649,7 +654,7 @@ def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float
 
 
 def _spare_basis(positions: FloatArray, missing: int) -> tuple[int, int, int, int]:
-    """Four dots without ``missing``, convex and clockwise where possible, with the largest smallest triangle."""
+    """Four dots excluding ``missing``, convex and clockwise where possible, with the largest smallest triangle."""
     points = [complex(x, y) for x, y in positions]
 
     def quality(rows: tuple[int, ...]) -> float:

@@ -51,7 +51,7 @@ from stereoservo_drivers.detectors.levels import EVEN, UNEVEN_INSIDE
 THINNEST = 1.0
 """Half axis [px] below which a dot is too thin to measure."""
 FEW_TOLERANCE = 0.7
-"""How far four or five dots of a face may lie from their predictions, up to a similarity [px]."""
+"""Largest distance of four or five dots of a face from their predictions, up to a similarity [px]."""
 
 
 SHAPE = 7
@@ -62,7 +62,7 @@ them.
 
 @kernel
 def whole(dot, lopsided):
-    """Whether a measurement (FIELDS,) is of a complete dot: not cut off, not merged with something else."""
+    """Whether a measurement (FIELDS,) is of a complete dot: not clipped, not merged with something else."""
     thin = smaller_half_axis(dot[QXX], dot[QXY], dot[QYY])
     # thin dots suffer from sampling: measured 0.04 at 2 px, 0.13 at 1.4 px
     limit = lopsided + np.exp(-1.4 * thin) + 2.5 * dot[LOPSIDED_NOISE] * np.sqrt(max(dot[NOISE], 0.08))
@@ -71,7 +71,7 @@ def whole(dot, lopsided):
 
 @kernel
 def median(values, used):
-    """The median of ``values`` (n,) that are ``used`` (n,), the lower one of two; 0 where none is."""
+    """The median of ``values`` (n,) that are ``used`` (n,), the lower one of two; 0 if none is used."""
     chosen = np.empty(values.size)
     n = 0
     for i in range(values.size):
@@ -87,7 +87,7 @@ def median(values, used):
 
 @kernel
 def agree_with_prior(predicted, dots, used, tolerance):
-    """Whether dots (n, FIELDS) lie on their predictions (n, 2) up to a similarity, within ``tolerance`` [px].
+    """Whether dots (n, FIELDS) agree with their predictions (n, 2) up to a similarity, within ``tolerance`` [px].
 
     For faces with too few dots to check one another: a prior may be off, but smoothly.
     """
@@ -149,14 +149,13 @@ def _deviation(dots, used, dark, bright):
 
 @kernel
 def settle_face(pattern, radius, dots, used, tolerance, least):
-    """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to
-    the dots' own.
+    """Check a face's dots (n, FIELDS) against one homography and move them from the ellipses' centres to the dots' own.
 
-    Uneven light is taken back. A dot whose light differs from the others' by so much that it may be off by more than
-    ``tolerance`` [px], half hidden or run into by something, is left out: nothing could tell whether it fits. Rows of
-    ``used`` that do not fit the others are cleared (of five or more; four are taken as they are); all are, where fewer
-    than ``least`` remain beside the one left out. The picture of a circle's centre is not the centre
-    of its picture; the face's homography tells the difference, no camera needed. Returns the number that remains.
+    Uneven light is compensated. A dot whose light differs from the others' so much that it may be displaced by more
+    than ``tolerance`` [px], half hidden or touched by something, is left out: its fit could not be verified. Rows of
+    ``used`` that do not fit the others are cleared (of five or more; four are accepted as they are); all are, if fewer
+    than ``least`` remain besides the one left out. The image of a circle's centre is not the centre of its image; the
+    face's homography determines the difference, without a camera model. Returns the number that remains.
     """
     n = pattern.shape[0]
     H = np.zeros((3, 3))
@@ -193,8 +192,7 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
             dots[i, 0] = raw[i, 0]
             dots[i, 1] = raw[i, 1]
     sigma = _deviation(dots, used, dark, bright)
-    # twice: a first shift under the homography of the ellipses' centres, which hardly differs, then the
-    # checked one
+    # twice: first with the homography of the ellipses' centres, which hardly differs, then with the checked one
     for step in range(2):
         if step == 1 and count >= 5:
             if not reject_outliers(pattern, dots, used, OutlierGates(tolerance, sigma, max(least, 5)), H):
@@ -207,10 +205,10 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
     away = np.zeros((n, 3))
     odd = outlier_dot(pattern, dots, used, sigma, away)
     if odd >= 0:
-        # it may be the others' print: it stays, as uncertain as it is odd
+        # it may be caused by the others' print: it is kept, with an uncertainty as large as its deviation
         dots[odd, EXX] += away[odd, 0] ** 2
         dots[odd, EYY] += away[odd, 0] ** 2
-    # dots that touch others helped to find the face; they are worth reporting only where they are needed
+    # dots that touch others helped to find the face; they are reported only if they are needed
     count = 0
     for i in range(n):
         count += 1 if used[i] and clear[i] else 0
@@ -227,33 +225,35 @@ def settle_face(pattern, radius, dots, used, tolerance, least):
 # -- lighting ------------------------------------------------------------------------------------------------
 # Correction of the dots' centres for uneven light (shading). Numba kernels; no state.
 #
-# Light falls on a dot as background b(x) and contrast g(x); to first order a slope of either moves the centroid, by
-# the columns DARK and LIT of its measurement. Both slopes are those of planes through the face's dots, whose predicted
-# areas turn flux into contrast; a single dot that fits badly (cut, dirty) does not count. How far the others lie off
-# the plane tells how much the light may bend, and so how uncertain its slope at a dot is; where that is much (bands of
-# mains light, the edge of a shadow), the slope inside the dot itself is believed more, by their variances.
+# The light on a dot has background b(x) and contrast g(x); to first order a slope of either shifts the centroid, by the
+# columns DARK and LIT of its measurement. Both slopes are those of planes through the face's dots, whose predicted
+# areas convert flux into contrast; a single dot that fits badly (cut, dirty) is ignored. The distance of the others
+# from the plane measures the curvature of the light, and so the uncertainty of its slope at a dot; if that is large
+# (bands of mains light, the edge of a shadow), the slope inside the dot itself has more weight, by their variances.
 
 
 BEND = 0.24
-"""Length over which light bends as much as it lies off its plane, in rms distances of a face's dots."""
+"""Length over which light deviates from its plane as much as the dots do, in rms distances of a face's dots."""
 PRINT_CONTRAST = 0.001
-"""Relative standard deviation of the light of alike dots, before anything is seen of it; also of predicted areas."""
+"""Prior relative standard deviation of the light of equal dots, before any is seen; also of predicted areas."""
 PRINT_BACKGROUND = 0.03
 """The same of backgrounds [grey levels]."""
 ODD_NOISE, ODD_REST = 25.0, 150.0
-"""A dot is odd beyond so many variances: of noise, and of what the others differ by (F of 1 and 3 degrees of freedom,
-0.999)."""
+"""Numbers of variances beyond which a dot is an outlier: of noise, and of the others' differences (F of 1 and 3 degrees
+of freedom, 0.999).
+"""
 SAMPLED_SLOPE = 0.018
-"""Standard deviation of a slope seen inside a dot by the sampling of its edge, times the root of its area
-(measured)."""
+"""Standard deviation of a slope seen inside a dot caused by the sampling of its edge, times the root of its area
+(measured).
+"""
 BLURRED_SLOPE = 0.12
-"""Part by which blur may have changed a slope seen inside a dot."""
+"""Relative change of a slope seen inside a dot that blur may have caused."""
 PRIOR_WEIGHT = 2.0
-"""How many degrees of freedom the two count."""
+"""Weight of either of these priors in degrees of freedom."""
 
 
 class DotReadings(NamedTuple):
-    """What the ``dots`` (n, FIELDS) of a face show: ``values`` (n,), which count where ``used`` (n,)."""
+    """Measured values of the ``dots`` (n, FIELDS) of a face: ``values`` (n,), which count where ``used`` (n,)."""
 
     dots: FloatArray
     values: FloatArray
@@ -264,8 +264,8 @@ class DotReadings(NamedTuple):
 def _plane(readings, out):
     """Least-squares plane a + b·x of `DotReadings` over the dots.
 
-    ``out``: middle (2), a, slope (2), its covariance (3) and the squared sum of residuals, both for unit noise; rms
-    distance from the middle. False where it is undetermined.
+    ``out``: centroid (2), a, slope (2), its covariance (3) and the squared sum of residuals, both for unit noise; rms
+    distance from the centroid. Returns False if it is undetermined.
     """
     dots, values, used = readings
     n = 0
@@ -310,7 +310,7 @@ def _residual(dot, value, plane):
 
 @kernel
 def _outlier(readings, variance, plane):
-    """The dot whose value the plane of the others contradicts, -1 for none; ``plane`` becomes that of the others."""
+    """The dot whose value contradicts the plane of the others, -1 for none; ``plane`` becomes that of the others."""
     dots, values, used = readings
     n = 0
     for i in range(used.size):
@@ -341,10 +341,10 @@ def _outlier(readings, variance, plane):
 
 @kernel
 def _known(readings, variance, typical, plane, slope):
-    """Slope (2) of `DotReadings` and its covariance (3) at any of the dots into ``slope``; the outlier dot, -1 for
-    none.
+    """Write the slope (2) of `DotReadings` and its covariance (3) at any of the dots to ``slope``; returns the outlier
+    dot, -1 for none.
 
-    ``variance`` of a value by noise; ``typical`` standard deviation beside it. -2 where there is no plane.
+    ``variance`` of a value by noise; ``typical``: further standard deviation. Returns -2 if there is no plane.
     """
     mine = readings.used.copy()
     own_readings = DotReadings(readings.dots, readings.values, mine)
@@ -366,8 +366,8 @@ def _known(readings, variance, typical, plane, slope):
 
 @kernel
 def _as_bright_as_its_light(dots, areas, used, i, away):
-    """Whether the flux of dot ``i``, which differs by ``away`` (relative) from the others', is explained by its
-    light and not its shape.
+    """Whether the flux of dot ``i``, which differs by ``away`` (relative) from the others', is explained by its light
+    and not its shape.
     """
     others = 0.0
     count = 0
@@ -381,7 +381,7 @@ def _as_bright_as_its_light(dots, areas, used, i, away):
 
 @kernel
 def _bend_inside(dots, used, slope, noise):
-    """Variance [1/px²] of the dots' own slopes about their face's; 0 where it may be noise (3 sigma) or sampling."""
+    """Variance [1/px²] of the dots' own slopes about their face's; 0 if it may be noise (3 sigma) or sampling."""
     n = squares = variances = largest = sampled = 0.0
     for i in range(used.size):
         if used[i] and dots[i, SLOPE_XX] < 0.5 * EVEN:
@@ -434,7 +434,7 @@ def _follow(dot, slope, noise, ground, moved):
         _add_covariance(dot, G, Symmetric2(t0 * t0, t0 * t1, t1 * t1))
     # (1 - K) P
     _add_covariance(dot, G, Symmetric2(p - k00 * p - k01 * q, q - k00 * q - k01 * r, r - k10 * q - k11 * r))
-    # the dot's own slope has noise in common with its centre: -(X Kᵀ Gᵀ + G K Xᵀ)
+    # the dot's own slope and its centre share noise: -(X Kᵀ Gᵀ + G K Xᵀ)
     m00, m01 = g00 * k00 + g01 * k10, g00 * k01 + g01 * k11
     m10, m11 = g10 * k00 + g11 * k10, g10 * k01 + g11 * k11
     x00, x01 = noise * dot[PULL], noise * dot[PULL + 1]
@@ -450,9 +450,9 @@ def _follow(dot, slope, noise, ground, moved):
 def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
     """Correct the centres ``moved`` (n, 2) of a face's ``dots`` (n, FIELDS) for uneven light.
 
-    ``areas`` (n,) [px²] as the face's homography predicts them. Adds to EXX .. EYY what remains uncertain: the slopes,
-    and for a dot whose light does not fit the others' as much as the missing part of its rim would move it. Returns
-    that dot's row, -1 where there is none.
+    ``areas`` (n,) [px²] as predicted by the face's homography. Adds the remaining uncertainty to EXX .. EYY: the
+    slopes, and for a dot whose light does not fit the others', the shift that the missing part of its rim would cause.
+    Returns that dot's row, -1 if there is none.
     """
     n = used.size
     values = np.zeros(n)
@@ -488,7 +488,7 @@ def flat_field(areas, used, dark_noise, bright_noise, dots, moved):
             dots[outlier, EXX] += away
             dots[outlier, EYY] += away
         if bend > 0.0:
-            # light that bends within a dot's size does so on black as on white
+            # light that varies within a dot's size does so on black as well as on white
             return max(outlier, -1)
     for i in range(n):
         values[i] = dots[i, BACKGROUND]

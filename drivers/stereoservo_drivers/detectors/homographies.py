@@ -15,7 +15,7 @@ from stereoservo.numerics.compilation import kernel
 
 ODD_NOISE, ODD_REST = 25.0, 70.0
 SINGULAR = 1e-11
-"""Pivot below which normal equations say nothing."""
+"""Pivot below which normal equations count as singular."""
 
 
 @kernel
@@ -144,9 +144,7 @@ def _solution(normal, h):
 
 @kernel
 def _fit(pattern, pixels, used, frame, h):
-    """Homography in normalised pixels into ``h`` (8,). False where it is undetermined or depths are not
-    positive.
-    """
+    """Homography in normalised pixels into ``h`` (8,). False if it is undetermined or depths are not positive."""
     n = 0
     frame[:] = 0.0
     for i in range(used.size):
@@ -189,12 +187,10 @@ def _in_pixels(frame, h, H):
 
 @kernel
 def fit_homography(pattern, pixels, used, H):
-    """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,),
-    into ``H``.
+    """Least-squares homography (3, 3) of pattern (n, 2) to pixels (n, 2) [px] over the rows ``used`` (n,), into ``H``.
 
-    Scaled to H[2, 2] = 1. Algebraic residuals reweighted by depth, so that the minimum is that of the pixel
-    residuals to first order. False where fewer than four rows are used, they are degenerate or depths are
-    not positive.
+    Scaled to H[2, 2] = 1. Algebraic residuals reweighted by depth, so that the minimum is that of the pixel residuals
+    to first order. Returns False if fewer than four rows are used, they are degenerate or depths are not positive.
     """
     frame, h = np.zeros(3), np.zeros(8)
     if not _fit(pattern, pixels, used, frame, h):
@@ -205,8 +201,8 @@ def fit_homography(pattern, pixels, used, H):
 
 @kernel
 def image_of_circle(H, x, y, radius, out):
-    """Image of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's centre,
-    ellipse area [px²], larger and smaller half axis [px]. False where it is not an ellipse seen from the front.
+    """Image of a circle: ``out`` = (u, v) of its centre's image, (du, dv) from there to the ellipse's centre, ellipse
+    area [px²], larger and smaller half axis [px]. Returns False if it is not an ellipse seen from the front.
     """
     w = H[2, 0] * x + H[2, 1] * y + H[2, 2]
     if w <= 0.0:
@@ -261,8 +257,8 @@ def _leave_one_out(pattern, pixels, used, frame, h, out):
     smallest root of I - L, its squared studentised residual [px²].
 
     A dot's distance, to first order, is |(I - L)⁻¹ e|, e its residual and L (2, 2) its leverage; a homography bends to
-    a single bad dot, so that e alone may hide most of its error. Rows of 0 where the others say nothing of a dot (five
-    dots, three of them collinear). False where the fit is degenerate.
+    a single bad dot, so that e alone may hide most of its error. Rows are 0 if the others do not determine a dot (five
+    dots, three of them collinear). Returns False if the fit is degenerate.
     """
     normal = _normal(pattern, pixels, used, frame, h)
     out[:] = 0.0
@@ -305,8 +301,8 @@ def _leave_one_out(pattern, pixels, used, frame, h, out):
 def outlier_dot(pattern, pixels, used, sigma, out):
     """The dot whose residual exceeds noise and the others' misfit, -1 if there is none; of six or more.
 
-    ``sigma`` [px] of a dot; ``out`` (n, 3) as :func:`_left_out` writes it. Beyond ODD_NOISE variances of noise and
-    ODD_REST of what the others misfit beyond noise (F of 2 and 4 degrees of freedom, 0.9998).
+    ``sigma`` [px] of a dot; ``out`` (n, 3) as :func:`_left_out` writes it. The limits are ODD_NOISE variances of noise
+    and ODD_REST times the others' misfit beyond noise (F of 2 and 4 degrees of freedom, 0.9998).
     """
     frame, h = np.zeros(3), np.zeros(8)
     n = 0
@@ -335,8 +331,8 @@ def outlier_dot(pattern, pixels, used, sigma, out):
 
 
 class OutlierGates(NamedTuple):
-    """How far a dot may lie from its prediction by the others: ``tolerance`` [px], and beside it what a dot's standard
-    deviation ``sigma`` [px] allows for; the ``least`` dots that must remain.
+    """Limits of a dot's distance from its prediction by the others: ``tolerance`` [px], and in addition that allowed by
+    a dot's standard deviation ``sigma`` [px]; ``least`` dots must remain.
     """
 
     tolerance: float
@@ -346,10 +342,10 @@ class OutlierGates(NamedTuple):
 
 @kernel
 def _worst_outlier(pattern, pixels, used, frame, h, gates):
-    """The dot with the largest leave-one-out residual, -1 where all are within tolerance.
+    """The dot with the largest leave-one-out residual, -1 if all are within tolerance.
 
-    It may be the tolerance and five standard deviations, of sigma times the largest root of
-    (I - L)⁻¹. Of the dots beyond, the one with the largest studentised residual goes. -2 where the fit is degenerate.
+    The limit is the tolerance plus five standard deviations, of sigma times the largest root of (I - L)⁻¹. Of the dots
+    beyond it, the one with the largest studentised residual is returned. -2 if the fit is degenerate.
     """
     tolerance, sigma, _ = gates
     out = np.zeros((used.size, 3))
@@ -367,11 +363,11 @@ def _worst_outlier(pattern, pixels, used, frame, h, gates):
 
 @kernel
 def reject_outliers(pattern, pixels, used, gates, H):
-    """Clear rows of ``used`` until each remaining dot lies as near to its prediction by the others as the
-    `OutlierGates` say.
+    """Clear rows of ``used`` until each remaining dot is as near to its prediction by the others as the `OutlierGates`
+    require.
 
-    False where fewer than their least dots would remain; with five dots left nothing tells which one is wrong, so that
-    it must be at least 5. ``H`` gets the homography.
+    Returns False if fewer than their least dots would remain; with five dots left the wrong one cannot be identified,
+    so that it must be at least 5. Writes the homography to ``H``.
     """
     frame, h = np.zeros(3), np.zeros(8)
     count = 0

@@ -7,8 +7,8 @@ from typing import Any, cast
 
 from numba import types
 
-# Read-only arrays: a kernel compiled for them takes writable ones too. Anything else would be compiled again
-# in the middle of the work.
+# Read-only arrays: a kernel compiled for them accepts writable ones, too. Other types would be compiled again during
+# operation.
 IMAGE = types.Array(types.uint8, 2, "C", readonly=True)
 BOOL = types.boolean
 INT = types.int64
@@ -39,7 +39,7 @@ SCRATCH = fields(written(INT32, 2), written(INT32, 2), written(SINGLE, 2))
 
 
 def compile_for(function: Callable[..., Any], *arguments: Any) -> None:
-    """Compile a kernel for these argument types, now, and for no others, ever. Idempotent."""
+    """Compile a kernel for these argument types, now, and for no others later. Idempotent."""
     dispatcher = cast(Any, function)
     if not dispatcher.signatures:
         dispatcher.compile(arguments)

@@ -1,10 +1,9 @@
-"""Learning of landmarks from simultaneous images of several cameras; their separation into tool and scene by a
-motion.
+"""Learning of landmarks from simultaneous images of several cameras; their separation into tool and scene by a motion.
 
-Corners (Shi and Tomasi 1994) of the first camera are found in the others: keypoints say roughly where, patches are
-aligned there to a hundredth of a pixel, and back again; the epipolar constraint, with what the alignments say of their
-noise, and the absence of a second place on the epipolar line that looks alike, decide (thesis 4.5 tracks Harris'
-points by correlation, and matches them so).
+Corners (Shi and Tomasi 1994) of the first camera are found in the others: keypoints give their approximate positions,
+and patches are aligned there to a hundredth of a pixel, forwards and backwards. A match is accepted if it satisfies the
+epipolar constraint, with the noise estimated by the alignments, and no second place on the epipolar line looks similar
+(thesis 4.5 tracks Harris' points by correlation, and matches them so).
 """
 
 from __future__ import annotations
@@ -46,18 +45,19 @@ from stereoservo_drivers.detectors.patch_alignment import (
 
 SMALLEST_PICTURE = 64
 AS_A_PLANE = 4.0
-"""Variance that one homography leaves over that of an epipolar geometry: below, the matches lie on one plane."""
+"""Ratio of the residual variances of one homography and of an epipolar geometry below which the matches are on a plane.
+"""
 BACK_PX = 0.5
 STAYED_PX, MOVED_PX = 0.5, 3.0
-"""How far a landmark may be off after a motion to have stayed, and must be to have moved."""
+"""Largest displacement of a landmark that counts as static after a motion, and least one that counts as moved."""
 STAYED_SIGMAS = 5.0
 BAND_PX = 3.0
 
 
 class LearningSettings(msgspec.Struct, frozen=True):
     """Settings. ``half``: of the patches' side [px]; ``most`` landmarks; ``spacing_px`` of corners; ``tilts``:
-    simulated oblique views, for cameras far apart; ``epipolar_px``: error of the epipolar constraint by lenses,
-    beside the noise [px]; ``least_correlation`` of patches of two cameras; ``margin``: by which a second match
+    simulated oblique views, for distant cameras; ``epipolar_px``: error of the epipolar constraint by lenses, in
+    addition to the noise [px]; ``least_correlation`` of patches of two cameras; ``margin``: by which a second match
     must correlate less; ``first_id``.
     """
 
@@ -92,7 +92,7 @@ class PairReport:
 
 @dataclass(frozen=True)
 class LearningReport:
-    """Report on ``pairs`` of the first camera with each other; ``left_out``: matched, but of uncertain kind."""
+    """Report on ``pairs`` of the first camera with each other one; ``left_out``: matched, but of uncertain kind."""
 
     pairs: tuple[PairReport, ...]
     left_out: int
@@ -103,9 +103,9 @@ def learn_landmarks(
     moved: Mapping[str, Sequence[ImageArray]] | None = None,
     settings: LearningSettings | None = None,
 ) -> tuple[Landmarks, LearningReport]:
-    """Landmarks from ``sights``: camera name to one or more images (h, w), of one moment or of a scene at rest.
+    """Landmarks from ``sights``: camera name to one or more simultaneous images (h, w), or images of a scene at rest.
 
-    ``moved``: the same after the arm alone has moved; without it every landmark is unsorted.
+    ``moved``: the same after only the arm has moved; without it every landmark is unsorted.
 
     Raises DriverError: ``images`` (cameras or sizes do not fit, no texture), ``too_few_matches``, ``no_landmarks``.
     """
@@ -351,7 +351,7 @@ def _unique(
 
 
 def _rival(picture: ImageArray, patch: ImageArray, at: FloatArray, line: FloatArray | None, half: int) -> float:
-    """Best correlation of ``patch`` elsewhere than ``at`` [px], within ``BAND_PX`` of ``line`` (3,); None:
+    """Best correlation of ``patch`` at other places than ``at`` [px], within ``BAND_PX`` of ``line`` (3,); None:
     anywhere.
     """
     scores = cv2.matchTemplate(picture, patch, cv2.TM_CCOEFF_NORMED)
@@ -371,8 +371,8 @@ def sort_landmarks(
 ) -> tuple[IntArray, BoolArray]:
     """Kinds (m,) of landmarks at ``pixels`` (m, 2) of the images ``before`` a motion, and which are certain (m,).
 
-    Tool: moved in some camera, stayed in none. Static: stayed in some, moved in none. What a motion along the line of
-    sight leaves in its place in one camera is in doubt.
+    Tool: moved in some camera, static in none. Scene: static in some, moved in none. If a motion along the line of
+    sight leaves a landmark at its place in one camera, its kind is uncertain.
     """
     m = len(next(iter(pixels.values())))
     stayed, moved = np.zeros(m, np.bool_), np.zeros(m, np.bool_)
@@ -387,7 +387,7 @@ def sort_landmarks(
 def _motion(
     before: ImageArray, pixels: FloatArray, after: ImageArray, settings: LearningSettings
 ) -> tuple[BoolArray, BoolArray]:
-    """Masks (m,) of one camera's landmarks that stayed, and that moved; those not found again are in neither."""
+    """Masks (m,) of one camera's landmarks that are static, and that moved; those not found again are in neither."""
     m = len(pixels)
     patches = ReferencePatches(before, pixels, settings.half)
     pyramid = build_pyramid(after, TEMPLATE_LEVELS)
@@ -414,7 +414,7 @@ def _motion(
 
 
 COLOURS = ((60, 160, 255), (90, 220, 90), (220, 220, 60))
-"""Tool, static, unsorted (BGR)."""
+"""Colours of tool, scene, unsorted (BGR)."""
 SHIFT = 4
 
 

@@ -1,4 +1,4 @@
-"""Search for the landmarks of one camera's reference in an image, and consistency of what was found."""
+"""Search for the landmarks of one camera's reference in an image, and consistency of the found ones."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ NEIGHBOURS = 6
 LOOKED_AT = 24
 FEW = 4
 AGREEING = 3
-"""Neighbours that must agree on where a landmark is."""
+"""Number of neighbours that must agree on a landmark's place."""
 BENT = 0.2
-"""How far neighbours may be off a landmark's own warp, as a share of their distance: surfaces are no planes."""
+"""Largest deviation of neighbours from a landmark's own warp, as a share of their distance: surfaces are not planes."""
 LOOSE_PX = 1.5
 START_COARSE = 2
-"""Pyramid levels from which a landmark is sought where it is only known roughly."""
+"""Pyramid levels at which the search for an only roughly known landmark starts."""
 
 
 class Surroundings:
@@ -73,7 +73,7 @@ class Surroundings:
     def coherent(self, A: FloatArray, found: FloatArray, use: BoolArray, least: int, *, one: bool) -> BoolArray:
         """Mask (m,) of landmarks of ``use`` that ``AGREEING`` neighbours confirm, in connected groups of ``least``.
 
-        ``one``: of each kind the largest group only: a rigid body is in one place.
+        ``one``: only the largest group of each kind: a rigid body is in one place.
         """
         use = use.copy()
         while True:
@@ -150,8 +150,8 @@ def search_by_keypoints(
 ) -> Alignment:
     """Search for all landmarks of a reference anywhere in an image, by planes of matched keypoints.
 
-    ``shifted_px``: only by keypoints that are so far from where they were. ``radius`` [px] about a landmark in which
-    keypoints speak for it.
+    ``shifted_px``: use only keypoints that moved at least this far. ``radius`` [px] around a landmark of the keypoints
+    that are used for it.
     """
     found = nothing(len(patches.pixels))
     matches = match_keypoints(reference, seen)
@@ -165,20 +165,20 @@ def search_by_keypoints(
 
 
 RATIO = 0.8
-"""Lowe's: a match's distance in descriptors over that of the second best."""
+"""Lowe's ratio: a match's distance in descriptors relative to that of the second best."""
 CONTRAST = 0.01
 NEAR_PX = 3.0
-"""Keypoints of one feature that tilted views give several times; a second best so near is the same."""
+"""Distance of keypoints of one feature, found several times in tilted views; a second best this near is the same."""
 TWINS = 4
-"""Second bests that are looked at for one elsewhere."""
+"""Number of second bests searched for one at another place."""
 CHUNK = 512
 PLANE_PX = 3.0
-"""How far a match may lie off the plane that it belongs to."""
+"""Largest distance of a match from its plane."""
 MAX_PLANES = 8
 MIN_PLANE = 7
-"""Matches that make a plane: four fix it, three more confirm it."""
+"""Number of matches that determine a plane: four fix it, three more confirm it."""
 FEW_NEAR = 4
-"""Matches about a pixel that a plane needs to speak for it."""
+"""Number of matches of a plane near a pixel that are needed to predict it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -
         return np.empty((0, 2), np.int64)
     best, distance, other, back = _nearest(first.descriptors, second)
     rows = np.arange(len(best))
-    # Where one feature has several keypoints, to come back to any of them is to come back.
+    # If one feature has several keypoints, returning to any of them counts as returning.
     returned = np.linalg.norm(first.pixels[back[best]] - first.pixels, axis=1) <= NEAR_PX
     good = returned & (distance < ratio * other)
     return np.column_stack([rows[good], best[good]])
@@ -216,8 +216,8 @@ def match_keypoints(first: Keypoints, second: Keypoints, ratio: float = RATIO) -
 def _nearest(
     descriptors: npt.NDArray[np.float32], among: Keypoints
 ) -> tuple[IntArray, FloatArray, FloatArray, IntArray]:
-    """Nearest neighbours: index of the nearest ``among``, its distance, that of the nearest not within ``NEAR_PX``
-    of it, (n,) each; and which of ``descriptors`` is nearest to each ``among`` (k,).
+    """Nearest neighbours: index of the nearest ``among``, its distance, that of the nearest one farther than
+    ``NEAR_PX`` from it, (n,) each; and which of ``descriptors`` is nearest to each ``among`` (k,).
     """
     n, k = len(descriptors), len(among.pixels)
     best, distance, other = np.zeros(n, np.int64), np.zeros(n), np.zeros(n)
@@ -259,7 +259,7 @@ class Plane:
 def find_planes(first: FloatArray, second: FloatArray) -> list[Plane]:
     """Planes, or approximately planar parts of the scene, among matches (n, 2) [px], the largest first.
 
-    A fixed seed: the same matches give the same planes.
+    The seed is fixed: the same matches yield the same planes.
     """
     planes: list[Plane] = []
     while len(planes) < MAX_PLANES and len(first) >= MIN_PLANE:
@@ -333,7 +333,7 @@ def starts_from_planes(
 
 
 def plausible(warps: FloatArray, *, least: float = 0.25, stretch: float = 4.0) -> BoolArray:
-    """Mask of warps (n, 2, 2) that a patch may be seen through: not mirrored, scale and stretch at most 4."""
+    """Mask of plausible warps (n, 2, 2) of a visible patch: not mirrored, scale and stretch at most 4."""
     good: BoolArray = np.isfinite(warps).all(axis=(1, 2))
     safe = np.where(good[:, None, None], warps, np.eye(2))
     singular = np.linalg.svd(safe, compute_uv=False)

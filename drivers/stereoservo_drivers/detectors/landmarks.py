@@ -1,7 +1,8 @@
 """Landmarks: natural features with ids common to all cameras of a cell, and their file.
 
-A file is written once, by `stereoservo learn-corners`; each camera's detector reads it and works alone. It holds one
-reference picture a camera, where each landmark is in it, and whether it belongs to the tool or to the scene.
+A file is written once, by `stereoservo learn-corners`; each camera's detector reads it and works independently. It has
+one reference picture per camera, the position of each landmark in it, and whether it belongs to the tool or to the
+scene.
 """
 
 from __future__ import annotations
@@ -28,12 +29,12 @@ MOST_LANDMARKS = 5000
 LARGEST_PICTURE = 64 * 2**20
 Kind = Literal["tool", "static", "unsorted"]
 KINDS: tuple[Kind, ...] = ("tool", "static", "unsorted")
-"""Moves with the arm; stands still; learnt without a picture after a motion, so that nobody knows."""
+"""Moves with the arm; static; learnt without a picture after a motion, so that the kind is unknown."""
 
 
 class CameraReference(msgspec.Struct, frozen=True, eq=False):
-    """Reference of one camera: ``name``, ``picture`` (h, w), the mean of ``averaged`` images; ``pixels`` (m, 2) of
-    the landmarks in it [px], NaN for those that it does not see, and their ``sigmas`` (m,) [px].
+    """Reference of one camera: ``name``, ``picture`` (h, w), the mean of ``averaged`` images; ``pixels`` (m, 2) of the
+    landmarks in it [px], NaN for invisible ones, and their ``sigmas`` (m,) [px].
     """
 
     name: str
@@ -44,7 +45,7 @@ class CameraReference(msgspec.Struct, frozen=True, eq=False):
 
 
 class Landmarks(msgspec.Struct, frozen=True, eq=False):
-    """Landmarks of a cell: ``ids`` (m,), ascending, and ``kinds`` (m,), positions in ``KINDS``; one reference a
+    """Landmarks of a cell: ``ids`` (m,), ascending, and ``kinds`` (m,), positions in ``KINDS``; one reference per
     camera.
     """
 
@@ -58,7 +59,7 @@ class Landmarks(msgspec.Struct, frozen=True, eq=False):
         return ids
 
     def camera(self, name: str) -> CameraReference:
-        """The reference of a camera. Raises DriverError (``landmarks``) where there is none."""
+        """The reference of a camera. Raises DriverError (``landmarks``) if there is none."""
         for camera in self.cameras:
             if camera.name == name:
                 return camera
@@ -98,7 +99,7 @@ def encode_landmarks(landmarks: Landmarks) -> bytes:
 
 
 def decode_landmarks(data: bytes, path: Path | str = "<landmarks>") -> Landmarks:
-    """Inverse of :func:`encode_landmarks`. Raises DriverError (``landmarks``) naming what does not fit."""
+    """Inverse of :func:`encode_landmarks`. Raises DriverError (``landmarks``) naming the mismatch."""
     with decoding(lambda cause: _bad(path, f"is not a file of landmarks: {cause}"), (DriverError,)):
         arrays = read_archive(data, LARGEST_FILE)
         try:
@@ -112,7 +113,7 @@ def decode_landmarks(data: bytes, path: Path | str = "<landmarks>") -> Landmarks
 
 
 def _landmarks(arrays: dict[str, npt.NDArray[Any]], path: Path | str) -> Landmarks:
-    """Landmarks out of the arrays of a file, which are taken out of ``arrays``. Raises anything."""
+    """Landmarks from the arrays of a file, which are removed from ``arrays``. May raise any exception."""
     header = msgspec.json.decode(arrays.pop("header").tobytes(), type=_LandmarkHeader)
     if header.schema != SCHEMA:
         raise _bad(path, f"schema is {header.schema}; this version reads {SCHEMA}")
@@ -135,7 +136,7 @@ def load_landmarks(path: Path) -> Landmarks:
     """Read and check a file of landmarks. Raises DriverError (``landmarks``)."""
     try:
         found = path.stat()
-        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # a pipe would be waited for
+        if not (stat.S_ISREG(found.st_mode) or stat.S_ISDIR(found.st_mode)):  # reading a pipe would block
             raise _bad(path, "is no regular file; `stereoservo learn-corners` writes one")
         size = found.st_size
         if size > LARGEST_FILE:
@@ -146,7 +147,7 @@ def load_landmarks(path: Path) -> Landmarks:
 
 
 def check_landmarks(landmarks: Landmarks, path: Path | str) -> None:
-    """Check shapes, ids and pixels. Raises DriverError (``landmarks``) where they are inconsistent."""
+    """Check shapes, ids and pixels. Raises DriverError (``landmarks``) if they are inconsistent."""
     m = len(landmarks.ids)
     if landmarks.ids.shape != (m,) or landmarks.kinds.shape != (m,):
         raise _bad(path, f"ids {landmarks.ids.shape} and kinds {landmarks.kinds.shape}; both must be (m,)")

@@ -1,4 +1,4 @@
-"""Grey levels of a dot and of what surrounds it: noise, slopes, background. Numba kernels; no state."""
+"""Grey levels of a dot and of its surroundings: noise, slopes, background. Numba kernels; no state."""
 
 from __future__ import annotations
 
@@ -30,25 +30,25 @@ from stereoservo_drivers.detectors.components import (
 from stereoservo_drivers.detectors.homographies import lower_root
 
 RING = 2
-"""Width of the surroundings outside the skirt [px] that give background and noise."""
+"""Width [px] of the surroundings outside the skirt used for background and noise."""
 INNER = 0.6
-"""Part of the ellipse's area whose level is looked at for slope and noise."""
+"""Part of the ellipse's area used for slope and noise."""
 MIN_INNER = 18
-"""Pixels of it without which nothing is said."""
+"""Least number of its pixels for an estimate."""
 TERMS = 7
-"""Of the levels inside, as :func:`inside` lists them."""
+"""Number of terms of the levels inside, listed in :func:`inside`."""
 UNEVEN_INSIDE = 0.005
-"""What these terms leave of a dot's own shape, as a part of its contrast: not noise."""
+"""Residual of a dot's own shape after these terms, as a share of its contrast: not noise."""
 UNLIKE_EVEN = 0.09
-"""And as a part of what the even terms explain: blur and motion that reach far into the dot (measured: 0.03 to 0.1)."""
+"""The same as a share of the even terms: blur and motion that reach far into the dot (measured: 0.03 to 0.1)."""
 EVEN = 1e6
-"""Variance [1/px²] of a slope of which nothing is known."""
+"""Variance [1/px²] of an unknown slope."""
 
 
 class Surface(NamedTuple):
-    """Levels about a dot: a plane and the tail of its blur, and the ``variance`` about them; -1 where there are none.
+    """Levels around a dot: a plane and the tail of its blur, and the ``variance`` about them; -1 if there are none.
 
-    ``plane_level``: that of the plane under the centre where the tail is not fitted; ``count`` of pixels.
+    ``plane_level``: that of the plane under the centre if the tail is not fitted; ``count`` of pixels.
     """
 
     variance: float
@@ -65,7 +65,7 @@ NO_SURFACE = Surface(-1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 @kernel
 def _fit_surface(sums):
-    """Least squares by the moments ``sums`` (15): the plane first, then the tail in what the plane leaves."""
+    """Least squares by the moments ``sums`` (15): first the plane, then the tail from the plane's residuals."""
     n = sums[0]
     if n < 24.0:
         return NO_SURFACE
@@ -109,14 +109,14 @@ class Band(NamedTuple):
 
 @reassociating_kernel
 def _ring_moments(pixels, valid, ellipse, box, band, sums):
-    """Sums over the VALID pixels of a ``box`` (its middle and half size in x, then in y) outside an ellipse's skirt
-    whose levels are in a ``band``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y,
-    tail², tail level; into ``sums`` (15,).
+    """Sums over the VALID pixels of a ``box`` (its centre and half size in x, then in y) outside an ellipse's skirt,
+    with levels in a ``band``: 1, level, x, y, x², xy, y², x level, y level, level², tail, tail x, tail y, tail², tail
+    level; into ``sums`` (15,).
     """
     level, xs, ys = pixels
     q11, q12, q22, cx, cy, skirt = ellipse
     width, inner = F(4.0) * skirt * skirt, skirt * skirt
-    # the tail falls like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
+    # the tail decreases like a Gaussian's: (1 - (δ² - skirt²) / ((skirt + RING)² - skirt²))³
     fall = F(1.0) / ((skirt + F(RING)) * (skirt + F(RING)) - inner)
     base, slope_x, slope_y, slope_t, limit = band
     si = sx = sy = sxx = sxy = syy = sxi = syi = sii = st = stx = sty = stt = sti = count = F(0.0)
@@ -155,11 +155,11 @@ def _ring_moments(pixels, valid, ellipse, box, band, sums):
 
 @kernel
 def surroundings(patch, planes, box, ellipse, limit):
-    """The surface about a dot's ``ellipse`` in a ``box`` of a patch, of variance [levels²] -1 where there is too
-    little to see.
+    """The surface around a dot's ``ellipse`` in a ``box`` of a patch; its variance [levels²] is -1 if too little is
+    visible.
 
-    Pixels off by more than ``limit``, then by more than three standard deviations (a neighbour's skirt, the plate's
-    edge) do not count.
+    Pixels that deviate by more than ``limit``, then by more than three standard deviations (a neighbour's skirt, the
+    plate's edge), are excluded.
     """
     left, top, right, bottom = box
     a, b = lanes(patch, max(top, patch.top), min(bottom, patch.bottom))
@@ -178,7 +178,7 @@ def surroundings(patch, planes, box, ellipse, limit):
         if fit.variance < 0.0:
             return NO_SURFACE
         limit = 3.0 * np.sqrt(fit.variance) + 0.5
-    # what lies within three standard deviations of a Gaussian has 0.973 of its variance
+    # the part of a Gaussian within three standard deviations has 0.973 of its variance
     variance = fit.variance / 0.973 if fit.variance > 1.0 else fit.variance
     return Surface(variance, fit.plane_level, fit.count, fit.level, fit.slope_x, fit.slope_y, fit.slope_t)
 
@@ -244,10 +244,11 @@ def _inner_moments(pixels, ellipse, base, A, right):
 
 @kernel
 def inside(patch, planes, ellipse, contrast, out):
-    """Relative slope of the level inside a dot with its covariance under unit noise, and the noise there, into ``out``.
+    """Write to ``out`` the relative slope of the level inside a dot with its covariance under unit noise, and the noise
+    there.
 
-    Least squares of the levels on 1, x², xy, y², q², x, y with q = dᵀQd < INNER: the even terms take up what blur and
-    motion do to a small dot.
+    Least squares of the levels on 1, x², xy, y², q², x, y with q = dᵀQd < INNER: the even terms absorb the effect of
+    blur and motion on a small dot.
     """
     out[BRIGHT] = -1.0
     out[SLOPE], out[SLOPE + 1] = 0.0, 0.0

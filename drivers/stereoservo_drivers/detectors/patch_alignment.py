@@ -1,11 +1,11 @@
-"""Patches of reference pictures found again to a hundredth of a pixel: affine, and whatever the light does.
+"""Alignment of patches of reference pictures to a hundredth of a pixel, with affine warps, independent of the light.
 
-Inverse compositional alignment (Baker and Matthews, Lucas-Kanade 20 years on, 2004) with the gain and the offset of
-the grey levels projected out. What the linear part of a warp leaves open (a lone edge or corner says little about
-shear) is held near its start.
+Inverse compositional alignment (Baker and Matthews, Lucas-Kanade 20 years on, 2004) with the gain and the offset of the
+grey levels projected out. The part of a warp's linear part that is not determined (a lone edge or corner hardly
+determines shear) is held near its start.
 
 A *warp* of a patch is ``(A (2, 2), p (2,))``: the reference pixel ``r`` is at ``p`` [px], and ``r + x`` at ``p + A x``.
-Level ``l`` of a pyramid has its pixel ``k`` over pixel ``2ˡ k`` of the image, as `cv2.pyrDown` has it.
+Level ``l`` of a pyramid has its pixel ``k`` over pixel ``2ˡ k`` of the image, as in `cv2.pyrDown`.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ TEMPLATE_LEVELS = 4
 SMALLEST_LEVEL = 24
 """Least side of a pyramid's picture [px]."""
 LEAST_DEVIATION = 4.0
-"""Standard deviation of a patch [grey levels] below which it shows nothing."""
+"""Standard deviation of a patch [grey levels] below which it is flat."""
 STIFFNESS = 2e-3
-"""How firmly the linear part is held, as a share of its mean observability."""
+"""Weight that holds the linear part, as a share of its mean observability."""
 ITERATIONS = 15
 CONVERGED_PX = 3e-3
 SLOPE_NOISE = 130.0 / 144.0
-"""Variance of the five-point difference of noise of variance one."""
+"""Variance of the five-point difference of noise with variance one."""
 PARAMETERS = 8
-"""Six of the warp, gain and offset: what a fit takes from the degrees of freedom of its residuals."""
+"""Six of the warp, gain and offset: the degrees of freedom that a fit removes from its residuals."""
 
 FOUND, OUTSIDE, LOST, RESTLESS = 0, 1, 2, 3
-"""Outcomes: aligned; out of the picture; run away or flat; not converged."""
+"""Outcomes: aligned; outside of the picture; diverged or flat; not converged."""
 
 
 def build_pyramid(image: ImageArray, levels: int) -> list[ImageArray]:
-    """Up to ``levels`` pictures, each half of the one before, as far as they keep ``SMALLEST_LEVEL`` a side."""
+    """Up to ``levels`` pictures, each half of the previous one, while their sides are at least ``SMALLEST_LEVEL``."""
     pyramid = [np.ascontiguousarray(image)]
     while len(pyramid) < levels and min(pyramid[-1].shape) >= 2 * SMALLEST_LEVEL:
         pyramid.append(cv2.pyrDown(pyramid[-1]))
@@ -55,10 +55,10 @@ SINGLE = types.float32
 class Templates:
     """Patches of one level of a reference picture, n of them with w = (2 half + 1)² pixels.
 
-    ``steps`` (n, 6, w): what turns grey levels into a warp step; ``levels`` (n, w): grey levels less their mean;
-    ``squares`` (n,): sum of their squares; ``slopes`` (n,): mean squared
-    gradient of an axis; ``offsets`` (n, 2): of the landmark from the patch's middle [px of the
-    level]; ``inverses`` (n, 6, 6): covariance of a step at noise one; ``valid`` (n,).
+    ``steps`` (n, 6, w): maps grey levels to a warp step; ``levels`` (n, w): grey levels minus their mean; ``squares``
+    (n,): sum of their squares; ``slopes`` (n,): mean squared gradient of an axis; ``offsets`` (n, 2): of the landmark
+    from the patch's centre [px of the level];
+    ``inverses`` (n, 6, 6): covariance of a step at noise one; ``valid`` (n,).
     """
 
     half: int
@@ -72,11 +72,11 @@ class Templates:
 
 
 def cut_templates(picture: ImageArray, pixels: FloatArray, half: int) -> Templates:
-    """Templates about ``pixels`` (n, 2) [px of the picture]; those that reach out of it or are flat are not valid."""
+    """Templates around ``pixels`` (n, 2) [px of the picture]; those that extend beyond it or are flat are not valid."""
     n, side = len(pixels), 2 * half + 1
     height, width = picture.shape
     grey = picture.astype(np.float64)
-    # Five-point differences: exact to third order, so that sharp texture is not taken for steeper than it is seen.
+    # Five-point differences: exact to third order, so that the gradient of sharp texture is not overestimated.
     kernel_x = np.array([[1.0, -8.0, 0.0, 8.0, -1.0]]) / 12.0
     du, dv = cv2.filter2D(grey, cv2.CV_64F, kernel_x), cv2.filter2D(grey, cv2.CV_64F, kernel_x.T)
     centres = np.where(np.isfinite(pixels), np.rint(pixels), -1e6).astype(np.int64)
@@ -141,7 +141,7 @@ class Template(NamedTuple):
 
 @kernel
 def _reaches_out(picture: ImageArray, half: int, A: FloatArray, p: FloatArray) -> bool:
-    """Whether a warped patch leaves what :func:`_sample_cubic` needs of the picture."""
+    """Whether a warped patch extends beyond the pixels of the picture that :func:`_sample_cubic` needs."""
     height, width = picture.shape
     reach_u, reach_v = half * (abs(A[0, 0]) + abs(A[0, 1])), half * (abs(A[1, 0]) + abs(A[1, 1]))
     return not (
@@ -157,7 +157,7 @@ def _compare(
     picture: ImageArray, template: Template, A: FloatArray, p: FloatArray, step: FloatArray
 ) -> tuple[float, float, float, float]:
     """Sums over a patch of the picture: of levels, of their squares, of their product with the template, and of the
-    squared weights of interpolation. ``step`` (6,) is what the template makes of the levels.
+    squared weights of interpolation. ``step`` (6,): the template's warp step for the levels.
     """
     half, steps, levels = template.half, template.steps, template.levels
     a00, a01, a10, a11 = A[0, 0], A[0, 1], A[1, 0], A[1, 1]
@@ -185,7 +185,7 @@ def _compare(
 
 @kernel
 def _compose_inverse(A: FloatArray, p: FloatArray, step: FloatArray, gain: float) -> bool:
-    """Take the template's ``step`` back in the picture: W <- W after its inverse. False if it is too large."""
+    """Compose the warp with the inverse of the template's ``step``: W <- W after its inverse. False if too large."""
     d00, d01, d10, d11 = 1.0 + step[0] / gain, step[1] / gain, step[2] / gain, 1.0 + step[3] / gain
     t0, t1 = step[4] / gain, step[5] / gain
     determinant = d00 * d11 - d01 * d10
@@ -209,7 +209,9 @@ def _align_patch(
     p: FloatArray,
     measured: FloatArray,
 ) -> int:
-    """Move the warp ``A`` (2, 2), ``p`` (2,) until its patch fits ``picture``: the outcome. ``measured`` (3,)."""
+    """Move the warp ``A`` (2, 2), ``p`` (2,) until its patch fits ``picture``; returns the outcome. Writes ``measured``
+    (3,).
+    """
     half, count = template.half, (2 * template.half + 1) ** 2
     start_u, start_v = p[0], p[1]
     step = np.empty(6)
@@ -224,9 +226,9 @@ def _align_patch(
         measured[0] = cross / np.sqrt(spread * template.square)
         measured[1] = gain
         left = max(spread - gain * gain * template.square, 0.0) / (count - PARAMETERS)
-        # The template's noise comes with the gain, the picture's less what interpolation takes from it.
+        # The template's noise is multiplied by the gain, the picture's reduced by interpolation.
         measured[2] = left / (gain * gain / template.averaged + attenuation / count)
-        if step[4] * step[4] + step[5] * step[5] < 1e-20:  # nothing to move by
+        if step[4] * step[4] + step[5] * step[5] < 1e-20:  # no motion left
             return FOUND
         if not _compose_inverse(A, p, step, gain):
             return LOST
@@ -251,7 +253,7 @@ class TemplateArrays(NamedTuple):
 
 
 class Warps(NamedTuple):
-    """Where m patches are, in and out: ``A`` (m, 2, 2), and ``p`` (m, 2) where the templates' middles are. Out:
+    """Positions of m patches, updated in place: ``A`` (m, 2, 2), and ``p`` (m, 2), of the templates' centres. Written:
     ``measured`` (m, 3): correlation, gain, noise variance [grey levels²] of one pixel of the pair; ``outcome`` (m,).
     """
 
@@ -276,7 +278,7 @@ def align_patches(picture: ImageArray, templates: Fields, chosen: IntArray, iter
 
 
 def compile_kernels() -> None:
-    """Compile what the alignment calls, or load it from the cache."""
+    """Compile the kernels of the alignment, or load them from the cache."""
     compile_for(_sample_cubic, IMAGE, FLOAT, FLOAT)
     compile_for(
         align_patches,
@@ -290,7 +292,7 @@ def compile_kernels() -> None:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where patches are: warps ``A`` (n, 2, 2) and ``pixels`` (n, 2) [px], ``covariances`` (n, 2, 2) [px²] of the
+    """Result of an alignment: warps ``A`` (n, 2, 2) and ``pixels`` (n, 2) [px], ``covariances`` (n, 2, 2) [px²] of the
     noise of both pictures, ``correlations`` (n,), and which were ``found`` (n,).
     """
 
@@ -302,9 +304,9 @@ class Alignment:
 
 
 class ReferencePatches:
-    """Patches about ``pixels`` (n, 2) [px] of a reference ``picture``, at every level of its pyramid.
+    """Patches around ``pixels`` (n, 2) [px] of a reference ``picture``, at every level of its pyramid.
 
-    ``averaged``: of how many pictures the reference is the mean; its noise is so much less.
+    ``averaged``: number of pictures averaged in the reference, which reduces its noise.
     """
 
     def __init__(self, picture: ImageArray, pixels: FloatArray, half: int, averaged: int = 1) -> None:
@@ -318,15 +320,15 @@ class ReferencePatches:
     def align(
         self, pyramid: list[ImageArray], chosen: IntArray, A: FloatArray, pixels: FloatArray, coarse: int
     ) -> Alignment:
-        """The ``chosen`` (m,) patches from start warps ``A`` (m, 2, 2), ``pixels`` (m, 2) [px].
+        """Align the ``chosen`` (m,) patches from start warps ``A`` (m, 2, 2), ``pixels`` (m, 2) [px].
 
-        ``coarse``: from so many levels above the finest on. A patch that is lost at a coarse level goes on from its
-        start at the next finer one.
+        ``coarse``: number of levels above the finest one at which it starts. A patch that is lost at a coarse level
+        continues from its start at the next finer one.
         """
         A, pixels = A.astype(np.float64), pixels.astype(np.float64)
         start_A, start = A.copy(), pixels.copy()
         sizes = np.sqrt(np.clip(np.abs(np.linalg.det(A)), 1e-6, 1e6))
-        # A patch seen smaller than in the reference is compared with a smaller reference, and the other way round.
+        # A patch seen smaller than in the reference is compared with a smaller reference, and vice versa.
         base_t = np.clip(np.rint(-np.log2(sizes)), 0, len(self._levels) - 1).astype(np.int64)
         base_i = np.clip(np.rint(np.log2(sizes)), 0, len(pyramid) - 1).astype(np.int64)
         covariances, correlations = np.zeros((len(chosen), 2, 2)), np.zeros(len(chosen))
@@ -366,10 +368,10 @@ class ReferencePatches:
         G[:, 0, 4] = G[:, 1, 5] = 1.0
         onto = np.einsum("kij,kjl->kil", A_level, G) * 2.0**i
         gain = np.where(measured[:, 1] > 0.0, measured[:, 1], 1.0)
-        # The picture's noise on the template's grid: the finer that grid, the fewer pixels stand behind a sample.
+        # The picture's noise on the template's grid: the finer that grid, the fewer pixels contribute to a sample.
         density = np.clip(1.0 / np.maximum(np.abs(np.linalg.det(A_level)), 1e-6), 0.4, 4.0)
         noise = measured[:, 2] * (density / gain**2 + 1.0 / self._averaged)
-        # Noise makes the template's gradients look steeper than they are, and every step too short.
+        # Noise makes the template's gradients appear steeper than they are, and every step too short.
         false = SLOPE_NOISE * measured[:, 2] / self._averaged / level.slopes[chosen]
         noise /= np.clip(1.0 - false, 0.6, 1.0) ** 2
         covariances = np.einsum("kia,kab,kjb->kij", onto, level.inverses[chosen], onto) * noise[:, None, None]

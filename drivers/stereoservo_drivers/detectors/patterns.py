@@ -1,4 +1,4 @@
-"""Faces among dots: the search for a planar pattern in a picture's spots. Numba kernels; no state.
+"""Recognition of faces among dots: the search for a planar pattern in a picture's spots. Numba kernels; no state.
 
 Pattern coordinates are those of :mod:`~stereoservo_drivers.detectors.homographies`.
 """
@@ -18,9 +18,9 @@ from stereoservo_drivers.detectors.kernel_types import BOOL, FLOAT, INT, compile
 CLEAR = 1.6
 """Least ratio of misfits between the second-best and the best explanation of the same dots."""
 ROUNDNESS = 4.25
-"""Sum of the half axes over the root of their product, of an ellipse of axes 1:16: no spot is thinner."""
+"""Sum of the half axes over the root of their product, for an ellipse of axes 1:16: no spot is thinner."""
 MOST_RIVALS = 32
-"""Explanations of as many dots beyond which nothing is clear."""
+"""Number of explanations by equally many dots above which the result is ambiguous."""
 
 
 @kernel
@@ -58,7 +58,7 @@ def _hypothesis(p, q, r, s, inverse, H):
 
 @kernel
 def _promising(pattern, pixels, basis, least, reach, H):
-    """Whether enough dots outside the basis have something near their place."""
+    """Whether enough dots outside the basis have a spot near their place."""
     missing = pattern.shape[0] - least
     for i in range(pattern.shape[0]):
         if i == basis[0] or i == basis[1] or i == basis[2] or i == basis[3]:
@@ -82,9 +82,10 @@ def _promising(pattern, pixels, basis, least, reach, H):
 
 @kernel
 def _assign(face, dots, reach, H, owner, circle):
-    """Dots nearest to the projected pattern of a face into ``owner`` (n,), -1 where none has the right place and size.
+    """Assign the nearest dots to the projected pattern of a face in ``owner`` (n,), -1 if none has the right place and
+    size.
 
-    Returns their number; 0 where the homography does not show the pattern from in front.
+    Returns their number; 0 if the homography does not show the pattern from the front.
     """
     pattern, radius = face.pattern, face.radius
     pixels, areas = dots
@@ -115,9 +116,7 @@ def _assign(face, dots, reach, H, owner, circle):
 
 @kernel
 def _least_areas(areas):
-    """Area that a dot's image has at least (m,), where it has been measured as ``areas`` (m,): blur inflates what is
-    thin.
-    """
+    """Least area of a dot's image (m,) for its measured ``areas`` (m,): blur enlarges thin dots."""
     # the inverse of area <= 1.25 pi (a + 0.7) (b + 0.7)
     slope = 0.7 * ROUNDNESS * np.sqrt(np.pi)
     least = np.empty(areas.size)
@@ -129,10 +128,10 @@ def _least_areas(areas):
 
 @kernel
 def _sizes_agree(foretold, depths, least, areas, quadruple, missing):
-    """Whether all but ``missing`` of the dots of a ``quadruple`` have areas as their homography foretells, loosely.
+    """Whether all but ``missing`` of the dots of a ``quadruple`` have areas roughly as predicted by their homography.
 
-    ``foretold`` is the fourth's area, ``depths`` (3) those of the first three over the fourth's: the areas are as
-    1 / depth³. Of the dots ``least`` (m,) and ``areas`` (m,).
+    ``foretold``: the fourth's area; ``depths`` (3): those of the first three over the fourth's: areas are proportional
+    to 1 / depth³. ``least`` (m,) and ``areas`` (m,): of the dots.
     """
     for i in range(4):
         cubed = 1.0 if i == 3 else depths[i] ** 3
@@ -145,9 +144,8 @@ def _sizes_agree(foretold, depths, least, areas, quadruple, missing):
 
 
 class SearchedFaces(NamedTuple):
-    """f faces of n dots that are searched for: ``patterns`` (f, n, 2) with dots of ``radii`` (f,) [pattern units]; each
-    with b quadruples of its dots, ``bases`` (f, b, 4), and the :func:`basis_inverse` of each, ``inverses``
-    (f, b, 3, 3).
+    """f faces of n dots to search for: ``patterns`` (f, n, 2) with dots of ``radii`` (f,) [pattern units]; for each b
+    quadruples of its dots, ``bases`` (f, b, 4), and the :func:`basis_inverse` of each, ``inverses`` (f, b, 3, 3).
     """
 
     patterns: FloatArray
@@ -166,7 +164,7 @@ class SearchedFace(NamedTuple):
 
 
 class Dots(NamedTuple):
-    """What a face is searched among: ``pixels`` (m, 2) and ``areas`` (m,) [px²]."""
+    """Dots among which a face is searched: ``pixels`` (m, 2) and ``areas`` (m,) [px²]."""
 
     pixels: FloatArray
     areas: FloatArray
@@ -188,14 +186,14 @@ class Rivals(NamedTuple):
 
 
 class Best(NamedTuple):
-    """How many ``dots`` the best explanation so far has, and how many ``rivals`` have as many."""
+    """Number of ``dots`` of the best explanation so far, and number of ``rivals`` with as many."""
 
     dots: int
     rivals: int
 
 
 class Scratch(NamedTuple):
-    """Memory of one search: a homography, a circle's image, two assignments (n,), and dots to fit to."""
+    """Memory of one search: a homography, a circle's image, two assignments (n,), and dots to fit."""
 
     H: FloatArray
     circle: FloatArray
@@ -209,7 +207,7 @@ class Scratch(NamedTuple):
 @kernel
 def _explain(face, dots, gates, rivals, best, scratch):
     """Number of dots that the homography in ``scratch`` explains, 0 if refused, and their misfit [px] from the better
-    homography that is fitted to all of them. Fewer than the ``best`` has, or what is known as a rival, are refused.
+    homography fitted to all of them. Refused: fewer dots than the ``best`` has, or an explanation known as a rival.
     """
     H, circle, trial, again, used, matched, distances = scratch
     pattern = face.pattern
@@ -233,7 +231,7 @@ def _explain(face, dots, gates, rivals, best, scratch):
     misfit = misfits(pattern, matched, used, H, distances)
     if misfit > gates.tolerance:
         return 0, 0.0
-    # sizes once more, under the better homography
+    # check sizes again, with the better homography
     if _assign(face, dots, gates.reach, H, again, circle) < count:
         return 0, 0.0
     return count, misfit
@@ -265,8 +263,8 @@ def _inverse_turns(pattern, basis):
 
 @kernel
 def _fourths(us, vs, three, turns, limit, out):
-    """Which dots at (us, vs) (m,) make triangles of the right sign with any two of ``three``, and of ``limit`` or more
-    times the pattern's, into ``out`` (m,); their number. ``turns`` as :func:`_inverse_turns` returns them.
+    """Write to ``out`` (m,) the dots at (us, vs) (m,) that make triangles of the right sign with any two of ``three``,
+    at least ``limit`` times the pattern's; returns their number. ``turns`` as returned by :func:`_inverse_turns`.
     """
     i, j, k = three
     _, s013, s023, s123 = turns
@@ -276,7 +274,7 @@ def _fourths(us, vs, three, turns, limit, out):
     for l in range(us.size):  # noqa: E741
         lu, lv = us[l] - us[i], vs[l] - vs[i]
         ijl, ikl = ju * lv - jv * lu, ku * lv - kv * lu
-        # that of j, k, l is what is left of the whole
+        # the triangle of j, k, l is the remainder of the whole
         right = (ijl * s013 >= limit) & (ikl * s023 >= limit) & ((turn - ijl + ikl) * s123 >= limit)
         # no branch: one in seven is right
         out[count] = l
@@ -288,12 +286,12 @@ def _fourths(us, vs, three, turns, limit, out):
 def find_face(face, dots, gates, owner):
     """Search a `SearchedFace` among `Dots`.
 
-    Every ordered quadruple of dots is held against every row of the face's bases, pruned by the signs and sizes of its
-    triangles, which the dots' areas foretell. A hypothesis counts when as many dots as the `Gates` ask for lie within
-    their tolerance of the homography fitted to all of them and are of the right size.
-    ``owner`` (n,) gets the dots' rows, -1 for missing ones. Returns the number found; 0 if none, or if
-    another assignment of some of the same dots explains as many nearly as well. (One of quite other dots is a second
-    copy of the pattern, which is found when these are taken away.)
+    Every ordered quadruple of dots is compared with every row of the face's bases, pruned by the signs and sizes of its
+    triangles, which are predicted from the dots' areas. A hypothesis counts if as many dots as the `Gates` require are
+    within their tolerance of the homography fitted to all of them and are of the right size. Writes the dots' rows to
+    ``owner`` (n,), -1 for missing ones. Returns the number found; 0 if none, or if another assignment of some of the
+    same dots explains as many nearly as well. (One of entirely other dots is a second copy of the pattern, which is
+    found when these dots are removed.)
     """
     pattern, radius, bases, inverses = face
     pixels, areas = dots
@@ -374,7 +372,7 @@ def find_copies(face, dots, gates, owners):
     while m >= gates.least and count < owners.shape[0]:
         for k in range(m):
             pixels[k, 0], pixels[k, 1], sizes[k] = centres[left[k], 0], centres[left[k], 1], areas[left[k]]
-        # the first basis is the corners, the others stand in where one is hidden
+        # the first basis is the corners; the others replace it if one is hidden
         first = 0
         found = 0
         while first < bases.shape[0] and found == 0:
@@ -400,8 +398,8 @@ def find_copies(face, dots, gates, owners):
 
 @kernel
 def find_faces(faces, sought, spots, gates, owners, counts):
-    """Occurrences of those `SearchedFaces` that are ``sought`` (f,) among ``spots`` (m, FIELDS) into ``owners``
-    (f, k, n), their numbers into ``counts`` (f,). Faces and `Gates` are the fields of their records.
+    """Write the occurrences of the `SearchedFaces` that are ``sought`` (f,) among ``spots`` (m, FIELDS) to ``owners``
+    (f, k, n), their numbers to ``counts`` (f,). Faces and `Gates` are the fields of their records.
     """
     patterns, radii, bases, inverses = faces
     dots = Dots(spots[:, :2].copy(), spots[:, AREA].copy())
@@ -413,7 +411,7 @@ def find_faces(faces, sought, spots, gates, owners, counts):
 
 
 def compile_kernels() -> None:
-    """Compile what the detector calls, or load it from the cache."""
+    """Compile the kernels that the detector calls, or load them from the cache."""
     compile_for(
         find_faces,
         fields(given(FLOAT, 3), given(FLOAT, 1), given(INT, 3), given(FLOAT, 4)),

@@ -1,8 +1,8 @@
-"""Corners of a tag from its whole printed pattern: the known cells, seen through a homography and blurred by a
+"""Corners of a tag from its whole printed pattern: the known cells, projected by a homography and blurred by a
 Gaussian, are fitted to the grey values of the tag.
 
-A search for each corner by itself looks at a few pixels, and is pulled inwards by blur: both legs of an L bend.
-The pattern's edges, all of them, say where the corners are ten times better, and how well.
+An independent search for each corner uses only a few pixels, and is biased inwards by blur: both legs of an L bend. All
+edges of the pattern together determine the corners ten times better, with their accuracy.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ from stereoservo_drivers.detectors.homographies import inverse_of, square_to_qua
 from stereoservo_drivers.detectors.kernel_types import FLOAT, IMAGE, compile_for, fields, given, written
 
 FIRST_BLUR_PX = 1.0
-"""Blur at which a fit begins, unless told otherwise; a larger one draws from further away."""
+"""Blur at which a fit starts by default [px]; a larger one converges from further away."""
 
 
 @dataclass(frozen=True)
 class Registered:
-    """A tag found in its place: ``corners`` (4, 2) [px] and their ``covariances`` (4, 2, 2) [px²], those of the noise.
+    """A registered tag: ``corners`` (4, 2) [px] and their ``covariances`` (4, 2, 2) [px²], those of the noise.
 
-    ``noise_variance`` [levels²] of the fit's residuals, ``contrast`` [levels] between white and black at the middle,
-    ``blur`` [px], ``correlation`` of pattern and image; ``misfit`` [px²]: what residuals that are alike within a cell
-    add to the covariances.
+    ``noise_variance`` [levels²] of the fit's residuals, ``contrast`` [levels] between white and black at the centre,
+    ``blur`` [px], ``correlation`` of pattern and image; ``misfit`` [px²]: part of the covariances from residuals that
+    are correlated within a cell.
     """
 
     corners: FloatArray
@@ -47,10 +47,10 @@ class Registered:
 def register_tag(
     image: ImageArray, start: FloatArray, cells: FloatArray, blur_px: float = FIRST_BLUR_PX
 ) -> Registered | None:
-    """Fit the blurred pattern of ``cells`` (n, n) to an image (h, w) about ``start`` (4, 2) [px].
+    """Fit the blurred pattern of ``cells`` (n, n) to an image (h, w) around ``start`` (4, 2) [px].
 
-    None where the fit cannot be believed: the grey values do not follow the pattern, a cell is not what the code
-    says, a corner moved by more than a cell.
+    Returns None if the fit is not credible: the grey values do not follow the pattern, a cell contradicts the code, a
+    corner moved by more than a cell.
     """
     corners, covariances, told = np.empty((4, 2)), np.empty((4, 2, 2)), np.empty(5)
     start = np.ascontiguousarray(start, dtype=np.float64)
@@ -60,7 +60,7 @@ def register_tag(
 
 
 def compile_kernels() -> None:
-    """Compile what the detector calls, or load it from the cache."""
+    """Compile the kernels that the detector calls, or load them from the cache."""
     compile_for(
         fit_tag,
         IMAGE,
@@ -87,7 +87,7 @@ _CONSTANTS = {
     **{f"{n}x{n}_{size}": f"DICT_{n}X{n}_{size}" for n in (4, 5, 6, 7) for size in (50, 100, 250, 1000)},
 }
 DICTIONARIES: tuple[str, ...] = tuple(_CONSTANTS)
-"""Every dictionary there is, by the name that a cell file gives it."""
+"""Names of all dictionaries, as used in cell files."""
 
 
 @cache
@@ -97,7 +97,7 @@ def dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def size_of(name: str) -> int:
-    """How many tags the dictionary has: ids 0 .. n - 1. Raises KeyError."""
+    """Number of tags in the dictionary: ids 0 .. n - 1. Raises KeyError."""
     return int(dictionary(name).bytesList.shape[0])
 
 
@@ -118,48 +118,48 @@ def tag_cells(name: str, tag: int) -> npt.NDArray[np.float64]:
 
 
 # -- fit of a tag --------------------------------------------------------------------------------------------
-# Compiled least-squares fit of a tag's printed pattern to grey values: first to few pixels, from wherever the start
-# is, then to many.
+# Compiled least-squares fit of a tag's printed pattern to grey values: first to few pixels, from any start, then to
+# many.
 #
 # Parameters (13): homography from local pixels to the tag (8, last entry 1), log of the blur, white level, its two
-# slopes, black as a part of white: light that falls off does so on both.
+# slopes, black as a share of white: a gradient of the light affects both.
 
 
 PARAMETERS = 13
 FEW_PIXELS, MOST_PIXELS = 250, 1500
-"""Of larger tags every n-th pixel is taken, on a lattice: at first, and at last."""
+"""Numbers of pixels, at first and at last: of larger tags every n-th pixel is used, on a lattice."""
 LEAST_BLUR, MOST_BLUR = 0.2, 4.0
 """Bounds of the blur's sigma [px]: a pixel's own square has 0.29."""
 REACH = 2.8
-"""Distance [sigmas, times the root of 2] from an edge beyond which it is not felt: erfc(2.8) = 7.5e-5."""
+"""Distance [sigmas, times the root of 2] from an edge beyond which it has no effect: erfc(2.8) = 7.5e-5."""
 HUBER = 2.5
-"""Residuals beyond so many standard deviations count linearly: shadows, scratches, ringing of JPEG."""
+"""Number of standard deviations beyond which residuals count linearly: shadows, scratches, ringing of JPEG."""
 SIGMA_OF_MEAN = 1.2533
 """Standard deviation over mean absolute deviation of a normal distribution."""
 FIRST_PASSES, LAST_PASSES = 14, 6
 NEAR_PX, SETTLED_PX = 0.1, 0.02
-"""A step shorter than this is the last of the first and of the last passes, which converge quadratically."""
+"""Step below which the first and the last passes end, which converge quadratically [px]."""
 HOPELESS = 0.3
-"""Least correlation of pattern and image at the start: below it nothing like the tag stands there."""
+"""Least correlation of pattern and image at the start: below it there is nothing like the tag."""
 QUANTISATION = 1.0 / 12.0
 """Least noise variance [grey levels squared]: rounding to whole levels."""
 MIN_CORRELATION = 0.9
 MAX_SHIFT_CELLS = 1.0
-"""A fit that correlates less with the image, or moved a corner further from its start, is not believed."""
+"""Limits of a credible fit: least correlation with the image, and largest displacement of a corner from its start."""
 MAX_CELL_ERROR = 0.45
-"""A cell whose grey is off by so much of the contrast is not what the code says: it was read wrong, or is covered."""
+"""Share of the contrast by which a cell's grey may deviate from the code: beyond it, it was misread, or is covered."""
 SATURATED = 254.5
-"""Grey level from which on a pixel may have been brighter than it tells."""
+"""Grey level from which on a pixel may be saturated."""
 TOTALS = 8
 BLOCK = 128
-"""Pixels whose derivatives are held at a time."""
+"""Number of pixels whose derivatives are stored at a time."""
 SQUARE = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 _FINE = 512
 _Z = np.arange(int(REACH * _FINE) + 3) / _FINE
 _HALF_ERF = np.array([0.5 * math.erf(z) for z in _Z])
 _BELL = np.exp(-_Z * _Z) / math.sqrt(math.pi)
-"""Tables for linear interpolation: 5e-7 off."""
+"""Tables for linear interpolation, with errors of 5e-7."""
 
 
 @kernel
@@ -177,8 +177,8 @@ def _edge(z):
 
 @kernel
 def _weigh(t, scale, n, out):
-    """Weights of the cells that are felt at coordinate ``t`` [cells], and their derivatives in t and in log sigma, into
-    ``out`` (3, n) from its first column on; ``scale`` is 1 / (root 2 sigma) [1/cells].
+    """Write to ``out`` (3, n), from its first column on, the weights of the cells with an effect at coordinate ``t``
+    [cells], and their derivatives in t and in log sigma; ``scale`` is 1 / (root 2 sigma) [1/cells].
 
     Returns the first cell and one past the last.
     """
@@ -207,8 +207,8 @@ def _weigh(t, scale, n, out):
 
 @reassociating_kernel
 def _place(us, vs, p, n, work):
-    """Of pixels at ``us``, ``vs`` (m,), into columns of ``work``: 1 / w of the homography, place (x, y) [cells], the
-    scales of `_weigh` along x and y, and the two terms of `_darken` for axes that are askew.
+    """Write for pixels at ``us``, ``vs`` (m,) to columns of ``work``: 1 / w of the homography, place (x, y) [cells],
+    the scales of `_weigh` along x and y, and the two terms of `_darken` for skewed axes.
     """
     sigma = math.exp(p[8])
     for k in range(us.size):
@@ -231,11 +231,11 @@ def _place(us, vs, p, n, work):
 
 @kernel
 def _darken(cells, work, size, across, down):
-    """Darkness, 0 white to 1 black, at each of ``size`` pixels of `_place`, into ``work``, and its derivatives in x and
-    y [1/cells] and in log sigma.
+    """Write the darkness, 0 white to 1 black, at each of ``size`` pixels of `_place` to ``work``, and its derivatives
+    in x and y [1/cells] and in log sigma.
 
-    A blur that is round in the image is none along two axes that are askew: at a corner, the bivariate normal
-    distribution in powers of their correlation (Pearson's tetrachoric series), two terms of it.
+    A blur that is round in the image is not separable along two skewed axes: at a corner, the bivariate normal
+    distribution is used in powers of their correlation (Pearson's tetrachoric series), with two terms.
     """
     n = cells.shape[0]
     for k in range(size):
@@ -259,10 +259,10 @@ def _darken(cells, work, size, across, down):
 
 
 class Sums(NamedTuple):
-    """Of a fit: the normal equations, the lower triangle of ``A`` (14, 14), whose last row is the right side and the
-    sum of squares; ``totals`` (8,): Huber's cost, the sums of squares of the clipped residuals, of pixels that are not
-    clipped, of |residual|, of model, model squared, model times grey (the three for the correlation), and of pixels
-    that tell nothing.
+    """Sums of a fit: the normal equations, the lower triangle of ``A`` (14, 14), with the right side and the sum of
+    squares in the last row; ``totals`` (8,): Huber's cost, the sums of squares of the clipped residuals, of pixels that
+    are not clipped, of |residual|, of model, model squared, model times grey (the three for the correlation), and of
+    pixels without information.
     """
 
     A: FloatArray
@@ -303,7 +303,7 @@ def _differentiate(samples, p, n, work, J):
 
 @kernel
 def _shown(p, us, vs):
-    """Whether every pixel lies before the plane of the tag."""
+    """Whether every pixel is in front of the plane of the tag."""
     least = math.inf
     for k in range(us.size):
         least = min(least, p[6] * us[k] + p[7] * vs[k] + 1.0)
@@ -314,8 +314,8 @@ def _shown(p, us, vs):
 def accumulate(samples, cells, p, huber, sums):
     """`Sums` of the fit at parameters ``p`` (13,), into ``sums``.
 
-    Residuals beyond ``huber`` [levels] count linearly; a pixel at the sensor's limit that the model has brighter tells
-    nothing. False where the homography does not show the tag.
+    Residuals beyond ``huber`` [levels] count linearly; a pixel at the sensor's limit with a brighter model has no
+    information. Returns False if the homography does not show the tag.
     """
     grey, us, vs = samples
     A, totals = sums
@@ -365,9 +365,9 @@ def accumulate(samples, cells, p, huber, sums):
 
 @kernel
 def cell_errors(samples, cells, p, out):
-    """How far each cell (n, n) is off the grey that the code gives it, in parts of the contrast, into ``out``.
+    """Write to ``out`` the deviation of each cell (n, n) from the grey of its code, as a share of the contrast.
 
-    By least squares, so that a neighbour's blur is no error; 0 where a cell has no pixel.
+    By least squares, so that a neighbour's blur is not an error; 0 for a cell without pixels.
     """
     grey, us, vs = samples
     n = cells.shape[0]
@@ -417,7 +417,7 @@ def _step(A, damping, step):
 
 @kernel
 def _moved(step, side):
-    """How far a step of the homography moves a corner [px], about."""
+    """Approximate displacement of a corner by a step of the homography [px]."""
     most = 0.0
     for a in range(8):
         most = max(most, abs(step[a]))
@@ -426,7 +426,7 @@ def _moved(step, side):
 
 @kernel
 def _correlation(grey, totals):
-    """Correlation of pattern and image; -1 where one of them is flat."""
+    """Correlation of pattern and image; -1 if one of them is flat."""
     m = grey.size
     mean, square = 0.0, 0.0
     for k in range(m):
@@ -440,7 +440,7 @@ def _correlation(grey, totals):
 @kernel
 def _approach(samples, cells, p, side, sums):
     """Levenberg-Marquardt with Huber's loss from a start that may be off by some pixels, until a step is shorter than
-    NEAR_PX; ``p`` and ``sums`` are those of its end. False where it finds nothing like the tag.
+    NEAR_PX; ``p`` and ``sums`` are those of its end. Returns False if there is nothing like the tag.
     """
     grey, (A, totals) = samples.grey, sums
     low, high = math.log(LEAST_BLUR / side), math.log(MOST_BLUR / side)
@@ -488,8 +488,8 @@ def _refine(samples, cells, p, side, huber, sums):
 
 @kernel
 def _clustered(samples, cells, p, huber, B):
-    """Covariance ``B`` (13, 13) of the fit's gradient as the residuals have it, cell by cell: light that is no plane, a
-    shadow's edge for one, leaves residuals that are alike within a cell, and do not average out as noise does.
+    """Covariance ``B`` (13, 13) of the fit's gradient from the residuals, cell by cell: light that is not a plane, such
+    as a shadow's edge, leaves residuals that are correlated within a cell, and do not average out as noise does.
     """
     grey, us, vs = samples
     n = cells.shape[0]
@@ -521,9 +521,9 @@ def _clustered(samples, cells, p, huber, B):
 
 @kernel
 def _corners(place, A, B, variance, corners, covariances):
-    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger
-    where the gradient's covariance ``B`` (13, 13) is more than that of such noise. Returns the variance [px²] that this
-    adds, in the mean over the coordinates; -1 where the normal equations are singular.
+    """Images (4, 2) [px] of the tag's corners and their covariances (4, 2, 2) [px²] for this noise variance, larger if
+    the gradient's covariance ``B`` (13, 13) exceeds that of such noise. Returns the variance [px²] that this adds, in
+    the mean over the coordinates; -1 if the normal equations are singular.
     """
     h, g, u0, v0, side = place
     scale, e, column = np.empty(PARAMETERS), np.zeros(PARAMETERS), np.empty(PARAMETERS)
@@ -588,11 +588,11 @@ def _corners(place, A, B, variance, corners, covariances):
 
 @kernel
 def fit_tag(image, start, cells, blur_px, found):
-    """Fit the pattern of ``cells`` (n, n) to an image (h, w) about ``start`` (4, 2) [px], with a blur of ``blur_px`` at
-    first. Into ``found``: corners (4, 2), covariances (4, 2, 2), and (5,) noise variance, contrast, blur,
+    """Fit the pattern of ``cells`` (n, n) to an image (h, w) around ``start`` (4, 2) [px], with an initial blur of
+    ``blur_px``. Writes to ``found``: corners (4, 2), covariances (4, 2, 2), and (5,) noise variance, contrast, blur,
     correlation, and the part of the covariances [px²] that is misfit.
 
-    False where the fit cannot be believed.
+    Returns False if the fit is not credible.
     """
     corners, covariances, told = found
     n = cells.shape[0]
@@ -637,7 +637,7 @@ def fit_tag(image, start, cells, blur_px, found):
     cell_errors(samples, cells, p, errors)
     if not errors.max() <= MAX_CELL_ERROR:
         return False
-    # Huber's estimator: E[psi²] / E[psi']², over the matrix of all pixels, whose sum A nearly is
+    # Huber's estimator: E[psi²] / E[psi']², over the matrix of all pixels, the sum of which A nearly is
     told_by = m - totals[7]
     variance = max(totals[1] / (told_by - PARAMETERS) * (told_by / totals[2]), QUANTISATION)
     B = np.empty((PARAMETERS, PARAMETERS))
@@ -661,7 +661,7 @@ def fit_tag(image, start, cells, blur_px, found):
 
 
 QUIET_CELLS = 0.5
-"""Fitted part of the white margin [cells]; a printed tag has one cell at least."""
+"""Fitted part of the white margin [cells]; a printed tag has at least one cell."""
 
 
 class Samples(NamedTuple):
@@ -673,8 +673,8 @@ class Samples(NamedTuple):
 
 
 class TagPlace(NamedTuple):
-    """Where a tag is: homography ``h`` (9,) from local places to the tag, and its inverse ``g`` (9,); (``u0``, ``v0``)
-    and ``side`` [px]: origin and unit of local places.
+    """Location of a tag: homography ``h`` (9,) from local places to the tag, and its inverse ``g`` (9,); (``u0``,
+    ``v0``) and ``side`` [px]: origin and unit of local places.
     """
 
     h: FloatArray
@@ -686,8 +686,8 @@ class TagPlace(NamedTuple):
 
 @kernel
 def sample_tag(image, place, n, most, samples):
-    """Number of the pixels within the tag of ``n`` cells a side and its quiet margin, about ``most`` of them on a
-    lattice: into the first rows of ``samples``, of which no more are written than there is room.
+    """Write to ``samples`` the pixels within the tag of ``n`` cells per side and its quiet margin, about ``most`` of
+    them on a lattice, in the first rows and at most as many as fit; returns their number.
     """
     h, g, u0, v0, side = place
     grey, us, vs = samples

@@ -1,7 +1,7 @@
-"""Detector of the straight edges of a part without markers: its vertices, as crossings of edges measured sub-pixel.
+"""Detector of the straight edges of a part without markers: its vertices, as intersections of edges measured sub-pixel.
 
-Where the edges are expected comes from a prior, from the frame before, or from the start of the part file; all are
-poses of the part, so that edges that it hides are not looked for. What is reported is measured anew in every frame.
+The expected edges follow from a prior, the previous frame, or the start in the part file; all are poses of the part, so
+hidden edges are not searched. The reported positions are measured in every frame.
 """
 
 from __future__ import annotations
@@ -38,19 +38,21 @@ from stereoservo_drivers.options import decode_options, invalid
 
 Positive = Annotated[float, Meta(gt=0)]
 FINE_PX = 4.0
-"""Half the width of the last search, and how near another edge may be."""
+"""Half the width of the last search, and least distance of other edges [px]."""
 NEAR_PX = 6.0
-"""Least of a search beside an expected edge."""
+"""Least half width of a search around an expected edge [px]."""
 SETTLED_PX = 0.3
-"""By how much vertices may still move where the last search found the edges."""
+"""Motion of the vertices [px] below which the last search counts as converged."""
 PRIOR_PX = 4.0
-"""Rms by which a prior may be off the part's shape, beside its own deviations."""
+"""Rms error [px] of a prior with respect to the part's shape, in addition to its own standard deviations."""
 LEAST_EDGES = 6
-"""That must agree on a pose, whose seven numbers they give twelve distances."""
+"""Number of edges that must agree on a pose: they give twelve distances for its seven parameters."""
 LEAST_SHARE, LEAST_OF_ALL = 0.6, 0.4
-"""Of the edges in sight that are long and free enough to be looked for: of those where the image has steps, of all."""
+"""Least shares of the agreeing edges, among visible ones that are long and free enough to be searched: of those where
+the image has steps, and of all.
+"""
 DISAGREE = 5.0
-"""Standard deviations, per line, beyond which lines do not meet in one point."""
+"""Number of standard deviations, per line, beyond which lines do not meet in one point."""
 
 
 class EdgeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -59,15 +61,15 @@ class EdgeOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     part: str
     """Part file, relative to the cell file's directory."""
     search_px: Annotated[float, Meta(ge=4, le=60)] = 16.0
-    """How far edges may be from where the start has them."""
+    """Largest distance of edges from their place in the start [px]."""
     min_slope: Positive = 2.5
     """Least steepness of an edge [grey levels/px]; a step of 10 levels in a sharp picture has 3."""
     max_residual_px: Positive = 1.0
-    """How far an edge may be off the part's shape: lenses bend, parts are not made to the drawing."""
+    """Largest distance of an edge from the part's shape [px]: lens distortion, manufacturing tolerances."""
     max_sigma_px: Positive = 0.5
-    """Vertices that are known no better are not reported: near-parallel edges, short ones."""
+    """Vertices with a larger standard deviation are not reported: near-parallel or short edges."""
     max_gap_s: Positive = 0.5
-    """A frame older than this is no start for the next."""
+    """Age above which a frame is not used as start for the next."""
     max_prior_age_s: Positive = 0.25
     floor_px: Annotated[float, Meta(ge=0)] = 0.02
     """Systematic standard deviation [px] of a line, part of every covariance."""
@@ -86,8 +88,8 @@ class _FoundPart:
 
 @dataclass(frozen=True, eq=False)
 class Vertices:
-    """Vertices found: ``rows`` (k,) of the part, ``pixels`` (k, 2), ``covariances`` (k, 2, 2); why others in sight are
-    not, by marker id.
+    """Vertices found: ``rows`` (k,) of the part, ``pixels`` (k, 2), ``covariances`` (k, 2, 2); and the reasons why
+    other visible ones are not, by marker id.
     """
 
     rows: list[int]
@@ -99,9 +101,10 @@ class Vertices:
 class EdgeDetector:
     """Detects the vertices of one part by its edges in one camera. One thread at a time.
 
-    It remembers where the part was in the last frame, and forgets it where the sequence goes back or time has passed:
-    the same *series* of frames and priors gives the same observations. Nothing is reported unless most of the edges in
-    sight, and six, agree on a pose of the part. ``refused``: of the newest frame, why vertices are not reported.
+    It stores the part's pose in the last frame, and drops it if the sequence goes back or is interrupted: the same
+    *series* of frames and priors yields the same observations. Nothing is reported unless most of the visible edges,
+    and at least six, agree on a pose of the part. ``refused``: reasons why vertices are not reported in the newest
+    frame.
 
     Raises DriverError: ``option``, ``part`` at construction; ``image_format``, ``image_size`` by :meth:`detect`.
     Content never raises.
@@ -146,7 +149,7 @@ class EdgeDetector:
     def _expectations(
         self, frame: Frame, prior: Prior | None, size: tuple[int, int]
     ) -> Iterator[tuple[PartPose, tuple[float, ...]]]:
-        """Poses to look at, each with half the widths [px] of its searches, the likeliest first."""
+        """Poses to try, each with half the widths [px] of its searches, the likeliest first."""
         seen = self._seen
         if seen is not None:
             gap_s = (frame.t_shutter_ns - seen.t_ns) * 1e-9
@@ -189,7 +192,7 @@ class EdgeDetector:
     def _register(
         self, image: FloatArray, pose: PartPose, widths: tuple[float, ...]
     ) -> tuple[PartPose, dict[int, MeasuredLine]] | None:
-        """The part's pose by its edges, and those that agree with it; None where too few do."""
+        """The part's pose from its edges, and the edges that agree with it; None if there are too few."""
         for half in widths:
             lines, *_ = self._lines(image, pose, half, coarse=True)
             better = pose_from_lines(self._part, pose, lines, max(1.0, 0.2 * half)) if len(lines) > 2 else None
@@ -217,8 +220,8 @@ class EdgeDetector:
     def _lines(
         self, image: FloatArray, pose: PartPose, half: float, *, coarse: bool
     ) -> tuple[dict[int, MeasuredLine], int, int]:
-        """Lines near the edges in sight by number, how many edges were long and free enough to look for, and at how
-        many of these the image has steps: where two faces look alike there is nothing to find.
+        """Lines near the visible edges by number, the number of edges long and free enough to be searched, and the
+        number of these where the image has steps: between two faces of equal brightness there is no step.
         """
         numbers, ends = segments_in_sight(self._part, pose)
         good = np.isfinite(ends).all(axis=(1, 2))
@@ -279,16 +282,17 @@ class EdgeDetector:
 
 
 # -- pose of the part ----------------------------------------------------------------------------------------
-# Pose of a part before a pinhole of unknown focal length, from pixels of its vertices or from measured lines.
+# Pose of a part in front of a pinhole camera of unknown focal length, from pixels of its vertices or from measured
+# lines.
 #
-# It only tells which edges are in sight and where about; what is reported are the lines themselves. Square pixels
-# about the image's centre are assumed, and a focal length near the image's width.
+# It only determines which edges are visible, and where approximately; the reported results are the measured lines. It
+# assumes square pixels, a principal point at the image's centre, and a focal length near the image's width.
 
 
 FOCAL_WIDTHS = 1.25
-"""Focal length at first, in widths of the image."""
+"""Initial focal length, in widths of the image."""
 FOCAL_SIGMA = 0.4
-"""Of its logarithm."""
+"""Standard deviation of its logarithm."""
 ITERATIONS = 12
 CONVERGED = 1e-6
 
@@ -317,7 +321,9 @@ class PartPose:
         return seen
 
     def slopes(self, points: FloatArray) -> FloatArray:
-        """Derivatives (n, 2, 7) of the pixels by a turn about the part's middle, a shift, and the focal's logarithm."""
+        """Derivatives (n, 2, 7) of the pixels by a turn about the part's centroid, a shift, and the focal length's
+        logarithm.
+        """
         turned = points @ self.R.T
         X = turned + self.t
         z = X[:, 2]
@@ -333,7 +339,7 @@ class PartPose:
         return J
 
     def stepped(self, step: FloatArray) -> PartPose:
-        """The pose after a step (7,) along `slopes`."""
+        """The pose after a step (7,), with the parameters of `slopes`."""
         turn = np.asarray(cv2.Rodrigues(step[:3].reshape(3, 1))[0], dtype=np.float64)
         return replace(
             self,
@@ -346,9 +352,9 @@ class PartPose:
 def pose_from_pixels(
     points: FloatArray, pixels: FloatArray, size: tuple[int, int], start: PartPose | None
 ) -> tuple[PartPose, float] | None:
-    """Pose that shows points (n, 3) at pixels (n, 2) of an image of ``size`` (width, height), n >= 4, and the rms
-    distance [px] that is left; from ``start`` where it is given. None where no pose with all points before the camera
-    is found.
+    """Pose that projects points (n, 3) to pixels (n, 2) of an image of ``size`` (width, height), n >= 4, and the
+    remaining rms distance [px]; from ``start`` if given. None if no pose with all points in front of the camera is
+    found.
     """
     width, height = size
     centre = np.array([0.5 * (width - 1), 0.5 * (height - 1)])
@@ -385,7 +391,7 @@ def _descend(pose: PartPose, points: FloatArray, pixels: FloatArray) -> tuple[Pa
 
 
 def _solve(pose: PartPose, J: FloatArray, left: FloatArray, weights: FloatArray, sigma: float) -> FloatArray:
-    """Step (7,) of weighted least squares, with what is expected of the focal length."""
+    """Step (7,) of weighted least squares, with the prior of the focal length."""
     expected = np.log(FOCAL_WIDTHS * (2.0 * pose.centre[0] + 1.0) / pose.focal) / FOCAL_SIGMA * sigma
     A = np.concatenate([J * weights[:, None], np.eye(7)[6:] * sigma / FOCAL_SIGMA])
     step: FloatArray = np.linalg.lstsq(A, np.append(left * weights, expected), rcond=1e-9)[0]
@@ -394,7 +400,7 @@ def _solve(pose: PartPose, J: FloatArray, left: FloatArray, weights: FloatArray,
 
 def line_distances(part: Part, pose: PartPose, lines: dict[int, MeasuredLine]) -> tuple[FloatArray, FloatArray]:
     """Distances (n, 2) [px] of the ends of n measured lines from the part's edges in the pose, and their derivatives
-    (n, 2, 7) by the pose, as `PartPose.slopes` has them.
+    (n, 2, 7) by the pose, as in `PartPose.slopes`.
     """
     rows = np.array(list(lines), dtype=np.int64)
     a, b = part.points[part.edges[rows, 0]], part.points[part.edges[rows, 1]]
@@ -413,8 +419,8 @@ def line_distances(part: Part, pose: PartPose, lines: dict[int, MeasuredLine]) -
 
 
 def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], scale_px: float) -> PartPose | None:
-    """Pose of least distance from measured lines, those far from it (beside ``scale_px``) counted little; None where
-    the part would come behind the camera.
+    """Pose of least distance from measured lines, with little weight on distant ones (relative to ``scale_px``); None
+    if the part would be behind the camera.
     """
     for _ in range(ITERATIONS):
         distances, J = line_distances(part, pose, lines)
@@ -423,7 +429,7 @@ def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], 
         worst = np.abs(distances).max(axis=1, keepdims=True)
         weights = np.sqrt(1.0 / (1.0 + (worst / scale_px) ** 2)) * np.ones((1, 2))
         step = _solve(pose, J.reshape(-1, 7), distances.ravel(), weights.ravel(), scale_px)
-        # A step beyond a quarter turn, or the part's distance, is no refinement.
+        # A step beyond a quarter turn, or the part's distance, is not a refinement.
         step = step / max(1.0, float(np.abs(step[:3]).max()) / 0.3, float(np.abs(step[3:6]).max()) / (0.3 * pose.t[2]))
         pose = pose.stepped(step)
         if float(np.abs(step).max()) < CONVERGED:
@@ -432,38 +438,38 @@ def pose_from_lines(part: Part, pose: PartPose, lines: dict[int, MeasuredLine], 
 
 
 def segments_in_sight(part: Part, pose: PartPose) -> tuple[IntArray, FloatArray]:
-    """Numbers (k,) of the edges in sight and their ends (k, 2, 2) [px]."""
+    """Numbers (k,) of the visible edges and their ends (k, 2, 2) [px]."""
     rows = np.flatnonzero(pose.in_sight(part))
     return rows, pose.pixels(part.points)[part.edges[rows]]
 
 
 # -- files of parts ------------------------------------------------------------------------------------------
-# Part files: a convex part without markers, as vertices with ids and faces, and where pictures show it at first.
+# Part files: a convex part without markers, as vertices with ids and faces, and its initial place in the pictures.
 
 
 FLAT = 1e-3
 """Largest distance of a face's vertices from its plane, and of others beyond it, as a share of the part's size."""
 LEAST_ANGLE = float(np.deg2rad(10.0))
-"""Least angle of the two edges that cross most squarely in a vertex."""
+"""Least angle, in a vertex, of the two edges with the largest angle."""
 LEAST_START = 4
-"""Vertices that a start must name: their pixels then determine a pose."""
+"""Number of vertices required in a start: their pixels then determine a pose."""
 
 
 class PartVertex(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A vertex: its marker ``id`` and where it is on the part, in any unit of length."""
+    """A vertex: its marker ``id`` and its position on the part, in any unit of length."""
 
     id: Annotated[int, Meta(ge=0, le=2**31 - 1)]
     at: tuple[float, float, float]
 
 
 class PartFace(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A plane face: the ids of its vertices along its border, either way round."""
+    """A plane face: the ids of its vertices along its border, in either direction."""
 
     vertices: Annotated[tuple[int, ...], Meta(min_length=3, max_length=64)]
 
 
 class PartFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A part file. ``start``: by camera, raw pixels of four vertices or more in a picture of the part at its start."""
+    """A part file. ``start``: by camera, raw pixels of four or more vertices in a picture of the part at its start."""
 
     vertex: Annotated[tuple[PartVertex, ...], Meta(min_length=4, max_length=200)]
     face: Annotated[tuple[PartFace, ...], Meta(min_length=1, max_length=200)]
@@ -473,7 +479,7 @@ class PartFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A part: ``ids`` (n,), ``points`` (n, 3) about their middle in units of their spread, ``normals`` (f, 3) outward
+    """A part: ``ids`` (n,), ``points`` (n, 3) about their centroid in units of their spread, ``normals`` (f, 3) outward
     and ``offsets`` (f,) of its faces, ``edges`` (e, 2) as rows of points, ``sides`` (e, f): which faces meet there.
     """
 
@@ -488,7 +494,7 @@ class Part:
 def load_part(path: Path, camera: str) -> tuple[Part, IntArray, FloatArray]:
     """The part of a file, and of the camera's start the rows (k,) of its vertices and their pixels (k, 2).
 
-    Raises DriverError (``part``), which names the file, the key, the value and what would be valid.
+    Raises DriverError (``part``), which names the file, the key, the value and the valid ones.
     """
 
     def refuse(text: str) -> DriverError:
@@ -508,7 +514,7 @@ def load_part(path: Path, camera: str) -> tuple[Part, IntArray, FloatArray]:
 
 
 def make_part(file: PartFile, refuse: Any = ValueError) -> Part:
-    """The part of decoded vertices and faces. Raises what ``refuse`` makes of a text."""
+    """The part of decoded vertices and faces. Raises the exception that ``refuse`` makes from a text."""
     ids = [vertex.id for vertex in file.vertex]
     if len(set(ids)) < len(ids):
         twice = next(marker for marker in ids if ids.count(marker) > 1)
@@ -569,7 +575,7 @@ def _face_plane(
 
 
 def _require_crossings(part: Part, refuse: Any) -> None:
-    """Refuse vertices in which no two edges cross at an angle."""
+    """Refuse vertices in which no two edges cross at a sufficient angle."""
     for row, marker in enumerate(part.ids.tolist()):
         own = part.edges[(part.edges == row).any(axis=1)]
         if len(own) < 2:

@@ -1,8 +1,8 @@
-"""Straight edges measured sub-pixel: profiles across where an edge is expected, the steepest place of each, and the
-line through these with its covariance.
+"""Straight edges measured sub-pixel: profiles across an expected edge, the steepest place of each, and the line through
+these with its covariance.
 
-An edge is a step that the lens has blurred. Its place in a profile is the maximum of the grey levels' derivative,
-smoothed by a Gaussian of ``SMOOTH`` px. The noise of these places is taken from their scatter about the line.
+An edge is a step blurred by the lens. Its place in a profile is the maximum of the grey levels' derivative, smoothed by
+a Gaussian of ``SMOOTH`` px. The noise of these places is estimated from their scatter about the line.
 """
 
 from __future__ import annotations
@@ -18,30 +18,30 @@ from stereoservo.numerics.compilation import Fields, kernel, plain
 from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, fields, given, written
 
 STEP = 0.5
-"""Of profiles [px]."""
+"""Sampling interval of profiles [px]."""
 SMOOTH = 1.0
 REACH = 3.0
-"""Of the smoothing filter [px]."""
+"""Half width of the smoothing filter [px]."""
 MOST_SAMPLES = 120
-"""Of an edge."""
+"""Largest number of profiles per edge."""
 LEAST_SAMPLES = 8
-"""Places on a line; with fewer it is not measured."""
+"""Least number of places on a line; with fewer it is not measured."""
 LEAST_SHARE = 0.65
-"""Of an edge's profiles that must have a place on its line."""
+"""Least share of an edge's profiles with a place on its line."""
 OFF_LINE = 3.0
-"""Standard deviations beyond which a place is not on the line."""
+"""Number of standard deviations beyond which a place is not on the line."""
 LEAST_OFF_PX = 0.3
 MOST_SCATTER_PX = 0.5
-"""Rms of places about their line at most."""
+"""Largest rms distance of places from their line [px]."""
 CANDIDATES = 4
 INTERPOLATION = 2.2
-"""By how much the variance of a mean of places exceeds that of independent ones: neighbours share pixels."""
+"""Ratio of the variance of a mean of places to that of independent ones: neighbours share pixels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Profiles:
-    """Grey levels' derivatives across expected edges: ``edge`` (s,) whose each is, ``t`` (s,) [px] along it from its
-    middle, ``slopes`` (s, k) [grey levels/px] at offsets ``at`` (k,) [px] along the edge's normal.
+    """Grey levels' derivatives across expected edges: ``edge`` (s,): edge of each profile, ``t`` (s,) [px] along it
+    from its centre, ``slopes`` (s, k) [grey levels/px] at offsets ``at`` (k,) [px] along the edge's normal.
     """
 
     edge: IntArray
@@ -52,8 +52,8 @@ class Profiles:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredLine:
-    """A line: ``middle`` (2,), unit vector ``along`` (2,), ``normal`` (2,); at ``t`` px along it lies ``offset + tilt
-    t`` px along the normal, with ``covariance`` (2, 2) of the two. ``span``: least and largest t measured.
+    """A line: ``middle`` (2,), unit vector ``along`` (2,), ``normal`` (2,); at ``t`` px along it its offset along the
+    normal is ``offset + tilt t`` px, with ``covariance`` (2, 2) of the two. ``span``: least and largest t measured.
     """
 
     middle: FloatArray
@@ -85,10 +85,10 @@ class MeasuredLine:
 def take_profiles(
     image: FloatArray, ends: FloatArray, edges: IntArray, others: FloatArray, half: float, clearance: float
 ) -> Profiles:
-    """Profiles across segments ``ends`` (e, 2, 2) [px], which are numbered by ``edges`` (e,), up to ``half`` px aside.
+    """Profiles across segments ``ends`` (e, 2, 2) [px], numbered by ``edges`` (e,), up to ``half`` px to each side.
 
-    Left out: those nearer than ``clearance`` [px] to another of the segments ``others`` (m, 2, 2), of which the first
-    e are ``ends``, and those that leave the ``image`` (height, width).
+    Excluded: those nearer than ``clearance`` [px] to another of the segments ``others`` (m, 2, 2), of which the first e
+    are ``ends``, and those that leave the ``image`` (height, width).
     """
     points, normals, where, t = [], [], [], []
     for number, (a, b) in zip(edges.tolist(), ends, strict=True):
@@ -157,8 +157,8 @@ def measure_lines(
 ) -> dict[int, MeasuredLine]:
     """Lines through the steepest places of the ``profiles`` of segments ``ends`` (e, 2, 2), numbered by ``edges`` (e,).
 
-    ``coarse``: the line that most places lie on, anywhere in the profiles; else the one nearest to the expected one.
-    Edges whose places lie on no line of one polarity are left out.
+    ``coarse``: the line with most places on it, anywhere in the profiles; else the one nearest to the expected one.
+    Edges without a line of one polarity are excluded.
     """
     offsets, slopes = _candidates(profiles, least_slope)
     lines = {}
@@ -200,12 +200,12 @@ class EdgePlaces(NamedTuple):
 
 @kernel
 def fit_line(places: Fields, sign: float, half: float, reach: float, found: FloatArray) -> None:
-    """Line through those of the ``places`` (the fields of `EdgePlaces`) whose slopes have ``sign``: ``found`` (7,)
-    gets how many profiles have a place on it (0: there is no line), offset, tilt, their covariance (1 1, 1 2, 2 2)
+    """Line through those of the ``places`` (the fields of `EdgePlaces`) whose slopes have ``sign``. Writes to ``found``
+    (7,): number of profiles with a place on it (0: there is no line), offset, tilt, their covariance (1 1, 1 2, 2 2)
     [px²] and the places' rms distance from it.
 
-    Places count by their slopes' squares. The search begins at the line on which most places within
-    ``reach`` lie, or at 0 where reach is 0; ``half``: half the segment's length.
+    Places are weighted by their squared slopes. The search starts at the line with most places within ``reach``, or at
+    0 if reach is 0; ``half``: half the segment's length.
     """
     t, offsets, slopes = places
     n, c = offsets.shape
@@ -246,7 +246,7 @@ def fit_line(places: Fields, sign: float, half: float, reach: float, found: Floa
             return
         da, db = (stt * sy - st * sty) / determinant, (sw * sty - st * sy) / determinant
         a, b = a + da, b + db
-        unit = max(0.0, syy - da * sy - db * sty) / (on - 2)  # of a place whose weight is 1
+        unit = max(0.0, syy - da * sy - db * sty) / (on - 2)  # of a place with weight 1
         variance = unit * on / sw
         gate = min(gate, max(LEAST_OFF_PX, OFF_LINE * np.sqrt(variance)))
         found[0], found[1], found[2] = on, a, b
@@ -259,7 +259,7 @@ def fit_line(places: Fields, sign: float, half: float, reach: float, found: Floa
 
 
 def compile_kernels() -> None:
-    """Compile what the measurement calls, or load it from the cache."""
+    """Compile the kernels of the measurement, or load them from the cache."""
     compile_for(
         fit_line,
         fields(given(FLOAT, 1), given(FLOAT, 2), given(FLOAT, 2)),

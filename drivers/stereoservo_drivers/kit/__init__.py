@@ -1,1 +1,1 @@
-"""What a joint driver of one's own is made with: half-duplex buses, freshness, and the checks that it must pass."""
+"""Building blocks of a custom joint driver: half-duplex buses, freshness, and the checks that it must pass."""

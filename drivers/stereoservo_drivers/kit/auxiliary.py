@@ -1,4 +1,4 @@
-"""Auxiliary joints and digital outputs of a driver: orders verified, and motion at the joints' own velocities."""
+"""Auxiliary joints and digital outputs of a driver: verified commands, and motion at the joints' own velocities."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from stereoservo.ports.devices import DriverError
 
 
 def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) -> None:
-    """Raises DriverError (``auxiliary``) for a name that is not there, or a value outside its limits."""
+    """Raise DriverError (``auxiliary``) for an unknown name, or a value outside its limits."""
     known = {spec.name: spec for spec in specs}
     for name, value in values.items():
         spec = known.get(name)
@@ -26,7 +26,7 @@ def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) 
 
 
 def verify_specs(specs: tuple[AuxiliarySpec, ...]) -> None:
-    """Raises DriverError (``options``) for a name that occurs twice, no range, or a joint that would never move."""
+    """Raise DriverError (``options``) for a duplicate name, an empty range, or a joint that would never move."""
     names = [spec.name for spec in specs]
     for spec in specs:
         if names.count(spec.name) > 1:
@@ -43,9 +43,10 @@ def verify_specs(specs: tuple[AuxiliarySpec, ...]) -> None:
 
 
 class AuxiliaryMotion:
-    """Simulated auxiliary joints, which go where they are ordered at their velocities, and outputs, at once.
+    """Simulated auxiliary joints, which move to commanded positions at their velocities, and outputs, which switch at
+    once.
 
-    Begins with every joint at the bound that is nearer to zero, and outputs off. Raises DriverError (``options``).
+    Initially every joint is at the bound nearer to zero, and outputs are off. Raises DriverError (``options``).
     """
 
     def __init__(self, specs: tuple[AuxiliarySpec, ...]) -> None:
@@ -56,13 +57,13 @@ class AuxiliaryMotion:
         self._now_ns: int | None = None
 
     def order(self, values: Mapping[str, float], now_ns: int) -> None:
-        """Take an order. Raises DriverError (``auxiliary``)."""
+        """Store a command. Raises DriverError (``auxiliary``)."""
         verify_order(values, self.specs)
         self.values(now_ns)
         self._orders |= values
 
     def stop(self, now_ns: int) -> None:
-        """Joints stand where they are; outputs keep their state."""
+        """Stop the joints at their positions; outputs keep their state."""
         self._orders = self.values(now_ns)
 
     def values(self, now_ns: int) -> dict[str, float]:

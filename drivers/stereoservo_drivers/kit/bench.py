@@ -1,4 +1,4 @@
-"""The bench of joint drivers under check: what is known of the device, and calls whose answers are verified."""
+"""Test bench of joint drivers: data on the device, and calls with verified results."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from stereoservo.ports.clock import MonotonicClock, VirtualClock
 from stereoservo.ports.devices import CommandReport, DriverContext, DriverError, JointDriver, JointState
 
 RUNAWAY, RUNAWAY_TIMES = 0.03, 3.0
-"""[rad or m], and times the commanded travel: an arm that goes farther is stopped."""
+"""[rad or m], and multiple of the commanded travel: an arm that travels farther is stopped."""
 FUTURE_NS = 1_000_000
-"""Several reads at one time of a virtual clock may carry growing stamps."""
+"""Tolerance of stamps in the future: several reads at one time of a virtual clock may have increasing stamps."""
 FRESH_SHARE = 0.5
-"""Of ``safety.joint_timeout_s``: the age at which samples may be read; the rest is for a cycle and for stalls."""
+"""Share of ``safety.joint_timeout_s`` that is the largest age of samples when read; the rest is for a cycle and stalls.
+"""
 STAMP_REMEDY = (
     "stamps are times of context.clock, never later than now, and rise; a device's own clock is brought to it by "
     "kit.device_clock"
@@ -38,13 +39,13 @@ RAISED = {
     "deactivate": "deactivate() may be called in any state, twice, too",
     "close": "close() raises nothing, in any state: catch there whatever the device raises",
 }
-"""Call -> what to do where it raises."""
+"""Call -> remedy if it raises."""
 
 
 class CheckFailedError(Exception):
-    """A check has failed; the text has what was found and what is required.
+    """A check has failed; the text has the finding and the requirement.
 
-    ``remedy``: what to do, where it is not that of the check.
+    ``remedy``: if it differs from that of the check.
     """
 
     def __init__(self, message: str, remedy: str = "") -> None:
@@ -53,16 +54,14 @@ class CheckFailedError(Exception):
 
 
 class CheckNotRunError(Exception):
-    """A check cannot be run here; the text says why."""
+    """A check cannot be run here; the text has the reason."""
 
 
 class Paced:
     """Time and context of a device under check."""
 
     real_time = False
-    """True: the device lives in real time (hardware, another process). False: it follows the context's
-    clock.
-    """
+    """True: the device runs in real time (hardware, another process). False: it follows the context's clock."""
 
     def make_context(self, folder: Path) -> DriverContext:
         """The context given to the driver."""
@@ -78,60 +77,58 @@ class Paced:
 
 
 class JointDriverSetup(Paced):
-    """What the checks of a joint driver need to know: override :meth:`make_driver`, and what else differs."""
+    """Data that the checks of a joint driver need: override :meth:`make_driver`, and anything else that differs."""
 
     speed = 0.05
     """Fraction of each joint's largest velocity at which the checks move the arm."""
     rest_velocity = 1e-3
-    """Below this [rad/s or m/s] the arm counts as at rest."""
+    """Velocity [rad/s or m/s] below which the arm counts as at rest."""
     brake_s = 1.0
     """Time [s] in which the arm must come to rest from ``speed``."""
     joint_timeout_s = SafetySection().joint_timeout_s
-    """``safety.joint_timeout_s`` of the cells that the driver is for: older samples stop the arm."""
+    """``safety.joint_timeout_s`` of the driver's cells: older samples stop the arm."""
     enforces_timeout = True
-    """Whether the device stops by itself when commands cease. Every device should; set False only with a
-    reason.
-    """
+    """Whether the device stops by itself when commands cease. Every device should; set False only with a reason."""
     fault_s = 1.0
-    """Time in which a device that has gone must be reported."""
+    """Time limit for reporting a lost device."""
     whole_range: bool | None = None
-    """Whether joints may be driven to their limits (None: where the device is simulated)."""
+    """Whether joints may be driven to their limits (None: only if the device is simulated)."""
 
     def make_driver(self, context: DriverContext) -> JointDriver:
-        """A new driver, connected to nothing."""
+        """A new driver, not connected."""
         raise NotImplementedError("override make_driver(context)")
 
     def configure(self, driver: JointDriver) -> None:
-        """Configure a driver; more where a device needs it."""
+        """Configure a driver; override it if a device needs more."""
         driver.configure()
 
     def unplug(self, driver: JointDriver) -> bool:
-        """Make the device disappear, as if its cable were pulled; returns whether that was done."""
+        """Make the device disappear, as if its cable were pulled; returns whether that was possible."""
         return False
 
     def plug_in(self, driver: JointDriver) -> None:
         """Undo :meth:`unplug`, once the driver is closed."""
 
     def break_down(self, driver: JointDriver) -> bool:
-        """Make the device fail by its own word (protective stop, hardware error); returns whether that was done."""
+        """Make the device report a failure (protective stop, hardware error); returns whether that was possible."""
         return False
 
     def mend(self, driver: JointDriver) -> None:
         """Undo :meth:`break_down`, as a person at the device does, once the driver is deactivated."""
 
     def device_writes(self, driver: JointDriver) -> int | None:
-        """How many writes the device has received so far; None where nobody counts them."""
+        """Number of writes received by the device so far; None if they are not counted."""
         return None
 
     def true_positions(self, driver: JointDriver) -> FloatArray | None:
-        """Where the joints are now (n,), in the driver's joint coordinates, but not by its word, and once it is closed,
-        too; None where nobody else measures them.
+        """Current joint positions (n,), in the driver's joint coordinates, measured independently of it, also after it
+        is closed; None if there is no such measurement.
         """
         return None
 
 
 class JointBench:
-    """Drivers under check, whose answers are verified with every call. ``close`` closes them."""
+    """Drivers under check, with the results of every call verified. ``close`` closes them."""
 
     def __init__(self, setup: JointDriverSetup, context: DriverContext) -> None:
         self.setup = setup
@@ -140,7 +137,7 @@ class JointBench:
         self._last: dict[int, JointState] = {}
 
     def new(self) -> JointDriver:
-        """A driver that is connected to nothing."""
+        """A new driver, not connected."""
         try:
             driver = self.setup.make_driver(self.context)
         except Exception as error:  # whatever a third party's constructor raises
@@ -164,7 +161,7 @@ class JointBench:
         return driver
 
     def close(self) -> None:
-        """Close all drivers. Raises CheckFailedError, once all are closed, where close() raises."""
+        """Close all drivers. Raises CheckFailedError, once all are closed, if close() raises."""
         raised: list[Exception] = []
         for driver in self._drivers:
             try:
@@ -178,7 +175,7 @@ class JointBench:
             self._drivers.clear()
 
     def failure(self, error: Exception) -> CheckFailedError:
-        """The failure that an exception of a driver's call is, by the calls that it came through."""
+        """The failure for an exception of a driver's call, by the calls in its traceback."""
         calls, trace = [], error.__traceback__
         while trace is not None:
             frame, trace = trace.tb_frame, trace.tb_next
@@ -191,7 +188,7 @@ class JointBench:
         return CheckFailedError(f"{calls[-1]}(){through} raised {told(error)}", RAISED[calls[-1]])
 
     def now_ns(self) -> int:
-        """Time of the driver's clock."""
+        """Current time of the driver's clock."""
         return self.context.clock.now_ns()
 
     def wait(self, seconds: float) -> None:
@@ -199,7 +196,7 @@ class JointBench:
         self.setup.wait(self.context, seconds)
 
     def read(self, driver: JointDriver) -> JointState:
-        """A joint sample. Raises CheckFailedError where it has another shape, is not finite, or goes back in time."""
+        """A joint sample. Raises CheckFailedError if it has another shape, is not finite, or goes back in time."""
         state = driver.read_state()
         count = len(driver.describe().joints)
         self._verify_arrays(state, count)
@@ -230,7 +227,7 @@ class JointBench:
             require(bool(np.isfinite(array).all()), f"{name} of a sample are {array.tolist()}, not finite")
 
     def write(self, driver: JointDriver, velocity: FloatArray) -> CommandReport:
-        """Command velocities (n,). Raises CheckFailedError where the report does not say what was asked."""
+        """Command velocities (n,). Raises CheckFailedError if the returned report differs from the command."""
         report = driver.write_velocity(velocity)
         require(
             isinstance(report, CommandReport) and np.array_equal(report.asked, velocity),
@@ -249,7 +246,7 @@ class JointBench:
     def drive(self, driver: JointDriver, velocity: FloatArray, seconds: float) -> list[JointState]:
         """Command ``velocity`` (n,) at the driver's rate for ``seconds``; returns the samples.
 
-        Raises CheckFailedError, with the arm stopped, where a joint goes much farther than it is commanded.
+        Raises CheckFailedError, with the arm stopped, if a joint moves much farther than commanded.
         """
         period = 1.0 / driver.describe().rate_hz
         states: list[JointState] = []
@@ -271,7 +268,7 @@ class JointBench:
         return states
 
     def settle(self, driver: JointDriver, seconds: float) -> JointState:
-        """Read only, for ``seconds``; returns the last sample."""
+        """Only read, for ``seconds``; returns the last sample."""
         period = 1.0 / driver.describe().rate_hz
         for _ in range(max(round(seconds / period), 1)):
             self.wait(period)
@@ -279,7 +276,7 @@ class JointBench:
         return state
 
     def require_rest(self, driver: JointDriver, after: str) -> None:
-        """Raise CheckFailedError where the arm does not stand."""
+        """Raise CheckFailedError if the arm is not at rest."""
         before = self.read(driver)
         state = self.settle(driver, 0.1)
         speed = float(np.abs(state.velocities).max())
@@ -304,7 +301,7 @@ def told(error: Exception) -> str:
 
 
 def refused(call: Callable[[], Any], what: str) -> str:
-    """Code of the DriverError that ``call`` must raise. Raises CheckFailedError where it does not."""
+    """Code of the DriverError that ``call`` must raise. Raises CheckFailedError if it does not."""
     try:
         call()
     except DriverError as error:
@@ -316,7 +313,7 @@ def refused(call: Callable[[], Any], what: str) -> str:
 
 
 def call_stop(driver: JointDriver, when: str) -> None:
-    """Call stop(). Raises CheckFailedError where it raises."""
+    """Call stop(). Raises CheckFailedError if it raises."""
     try:
         driver.stop()
     except Exception as error:

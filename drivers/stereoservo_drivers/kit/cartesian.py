@@ -1,4 +1,4 @@
-"""Joint drivers of arms that take Cartesian velocities: six virtual joints over a device of few calls."""
+"""Joint drivers of arms that are commanded by Cartesian velocities: six virtual joints over a device with few calls."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from stereoservo_drivers.kit.virtual_joints import VirtualLimits, positions_of, 
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 
 Frame = Literal["base", "tool"]
-"""Whose axes the robot's interface gives twists in; both are of the tool's point."""
+"""Axes of the twists in the robot's interface; both twists are of the tool's point."""
 
 
 class CartesianState(NamedTuple):
-    """What the robot tells: stamp, ``pose`` (4, 4) base from tool [m], and the twist of the tool's point, ``v`` (3,)
-    [m/s] and ``w`` (3,) [rad/s], in the base frame.
+    """State reported by the robot: stamp, ``pose`` (4, 4) base from tool [m], and the twist of the tool's point, ``v``
+    (3,) [m/s] and ``w`` (3,) [rad/s], in the base frame.
     """
 
     t_ns: int
@@ -31,7 +31,7 @@ class CartesianArm(Protocol):
     """Protocol of a robot's Cartesian-velocity interface. All but ``stop`` and ``close`` may raise DriverError."""
 
     def connect(self) -> None:
-        """Connect; nothing moves. Called again where a fault was reset."""
+        """Connect; nothing moves. Called again after the reset of a fault."""
         ...
 
     def enable(self) -> None:
@@ -39,11 +39,11 @@ class CartesianArm(Protocol):
         ...
 
     def read(self) -> CartesianState:
-        """The newest state. Raises DriverError where the robot has stopped by itself, with what to do."""
+        """The newest state. Raises DriverError, with the remedy, if the robot has stopped by itself."""
         ...
 
     def write(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Command a twist, in the axes that the driver was told; returns what is carried out of it."""
+        """Command a twist, in the axes given to the driver; returns the twist that is executed."""
         ...
 
     def stop(self) -> None:
@@ -61,9 +61,9 @@ class CartesianArm(Protocol):
 
 class CartesianJointDriver:
     """A joint driver over a :class:`CartesianArm`. ``description``: see `cartesian_description`; ``attitude`` (3, 3):
-    of the tool in the base frame, about which its turns are counted (`virtual_joints.turn` of a rotation vector).
+    of the tool in the base frame, the zero of its turns (`virtual_joints.turn` of a rotation vector).
 
-    The pose that the robot tells serves as joint positions; what is reached is judged in the images, as ever.
+    The pose reported by the robot serves as joint positions; as always, reaching a goal is determined in the images.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class CartesianJointDriver:
         return self._description
 
     def configure(self) -> None:
-        """Connect the robot. Raises DriverError, also where its tool stands too far from the attitude."""
+        """Connect the robot. Raises DriverError, also if its tool is too far from the attitude."""
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED)
         self._arm.connect()
         self._follow(self._arm.read())
@@ -118,7 +118,7 @@ class CartesianJointDriver:
             raise DriverError("command", f"write_velocity() got {asked.tolist()}; six finite velocities are needed")
         told = self._arm.read()
         self._follow(told)
-        # Slides share one acceleration, turns another: half of it is there for each to brake before its limit.
+        # Slides share one acceleration, turns another: half of it is available for each to brake before its limit.
         down, up = (np.sqrt(self._acceleration * np.maximum(room, 0.0)) for room in self._room())
         cut = np.clip(asked, -np.minimum(down, self._fastest), np.minimum(up, self._fastest))
         v, w = self._in_axes(*twist_of(self._positions, cut, self._attitude))
@@ -131,7 +131,7 @@ class CartesianJointDriver:
     def stop(self) -> None:
         """Bring the arm to rest. Any state; never raises."""
         if self._life.state in (LifecycleState.CONFIGURED, LifecycleState.ACTIVE):
-            with contextlib.suppress(Exception):  # a robot that is gone is told by the next read
+            with contextlib.suppress(Exception):  # the next read reports a robot that is gone
                 self._arm.stop()
 
     def deactivate(self) -> None:
@@ -145,12 +145,12 @@ class CartesianJointDriver:
         """Stop, disconnect. Idempotent; never raises."""
         self.stop()
         if self._life.state is not LifecycleState.CLOSED:
-            with contextlib.suppress(Exception):  # nothing is left that could be told
+            with contextlib.suppress(Exception):  # no error can be reported any more
                 self._arm.close()
         self._life.state = LifecycleState.CLOSED
 
     def _follow(self, told: CartesianState) -> None:
-        """Take what the robot tells. Raises DriverError, and keeps what is known, where that is no pose or twist."""
+        """Store the robot's state. Raises DriverError, and keeps the previous one, if the pose or twist is invalid."""
         if not all(np.isfinite(part).all() for part in (told.pose, told.v, told.w)):
             raise DriverError(
                 "pose",
@@ -162,7 +162,7 @@ class CartesianJointDriver:
         self._pose = told.pose
 
     def _room(self) -> tuple[FloatArray, FloatArray]:
-        """Ways (6,) to the lower and the upper limits."""
+        """Distances (6,) to the lower and the upper limits."""
         return self._positions - self._low, self._high - self._positions
 
     def _in_axes(self, v: FloatArray, w: FloatArray) -> tuple[FloatArray, FloatArray]:

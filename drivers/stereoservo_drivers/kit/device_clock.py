@@ -1,13 +1,13 @@
-"""Stamps of devices that send a time of their own with their samples, in the time of this computer."""
+"""Conversion of stamps of devices with a clock of their own to the time of this computer."""
 
 from __future__ import annotations
 
 
 class DeviceClock:
-    """Brings the times of a device's own clock to ``context.clock``, by the samples that came through fastest.
+    """Converts times of a device's own clock to ``context.clock``, by the samples with the shortest delay.
 
-    ``drift``: the two clocks run apart by less than this share. What the fastest sample took stays in the stamps, which
-    are that much late.
+    ``drift``: upper bound of the relative drift of the two clocks. The delay of the fastest sample remains in the
+    stamps, which are late by it.
     """
 
     def __init__(self, drift: float = 2e-4) -> None:
@@ -15,9 +15,10 @@ class DeviceClock:
         self._offset_ns = self._device_ns = self._stamp_ns = 0
 
     def stamp(self, device_s: float, now_ns: int) -> int:
-        """Time [ns] of the sample that the device measured at its own time ``device_s`` and that is here at ``now_ns``.
+        """Time [ns] of the sample that the device measured at its own time ``device_s`` and that was received at
+        ``now_ns``.
 
-        It is never later than ``now_ns`` and never goes back. A device whose time goes back has started anew.
+        It is never later than ``now_ns`` and never goes back. A device whose time goes back has restarted.
         """
         device_ns = round(device_s * 1e9)
         lateness_ns = now_ns - device_ns

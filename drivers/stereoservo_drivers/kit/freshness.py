@@ -1,4 +1,4 @@
-"""Freshness of what a device tells: the newest sample, and a fault once it is too old."""
+"""Freshness of a device's samples: the newest sample, and a fault once it is too old."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from stereoservo.ports.devices import DriverError, JointState
 
 
 class Freshness:
-    """Keeps the newest sample. Older than ``limit_s`` it is a fault, not a sample."""
+    """Stores the newest sample. If it is older than ``limit_s``, reading it is a fault."""
 
     def __init__(self, limit_s: float) -> None:
         self._limit_ns = round(limit_s * 1e9)
         self._newest: JointState | None = None
 
     def put(self, sample: JointState) -> JointState:
-        """Keep a new sample, and return it."""
+        """Store a new sample, and return it."""
         self._newest = sample
         return sample
 

@@ -1,4 +1,4 @@
-"""A half-duplex serial bus of servos: one line, one question at a time, one answer for each servo that is asked."""
+"""A half-duplex serial bus of servos: one line, one request at a time, one answer of each addressed servo."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class ByteStream(Protocol):
         ...
 
     def read(self, size: int, /) -> bytes:
-        """At most ``size`` bytes that have arrived; empty where there are none."""
+        """At most ``size`` bytes that have arrived; empty if there are none."""
         ...
 
     def close(self) -> None:
@@ -32,7 +32,7 @@ class ByteStream(Protocol):
 
 def open_serial(url: str, baudrate: int) -> ByteStream:
     """A serial port by its name or pyserial URL. Raises DriverError (``connection``)."""
-    import serial  # only who talks to a real port needs it
+    import serial  # only needed for a real port
 
     try:
         stream: ByteStream = serial.serial_for_url(url, baudrate=baudrate, timeout=0, write_timeout=0.1, exclusive=True)
@@ -49,12 +49,12 @@ def open_serial(url: str, baudrate: int) -> ByteStream:
 
 
 class HalfDuplexBus:
-    """A bus on ``stream``; ``split`` finds one packet in what has arrived.
+    """A bus on ``stream``; ``split`` finds one packet in the received data.
 
-    ``split(data)`` returns the first whole packet and how many bytes to drop, with the packet or before it; None where
-    there is none yet. Adapters that echo what is sent are served, too. ``answer_s``: how long each servo may take: from
-    the question to the first answer, and from each answer to the next.
-    ``lost_after``: so many questions in a row without all answers, and the connection is taken for lost.
+    ``split(data)`` returns the first whole packet and the number of bytes to drop, with the packet or before it; None
+    if there is none yet. Adapters that echo sent data are supported.
+    ``answer_s``: time limit of each servo: from the request to the first answer, and from each answer to the next.
+    ``lost_after``: number of consecutive requests without all answers after which the connection counts as lost.
     """
 
     def __init__(
@@ -70,21 +70,21 @@ class HalfDuplexBus:
         self._answer_s = answer_s
         self._lost_after = lost_after
         self.missed = 0
-        """Questions in a row without all answers."""
+        """Consecutive requests without all answers."""
 
     def send(self, packet: bytes) -> None:
-        """Send a packet that nobody answers. Raises DriverError (``connection_lost``)."""
+        """Send a packet without an answer. Raises DriverError (``connection_lost``)."""
         try:
             self._stream.write(packet)
-        except Exception as error:  # pyserial, sockets and simulated lines raise each their own
+        except Exception as error:  # pyserial, sockets and simulated lines raise different exceptions
             raise self._lost(f"sending: {error}") from error
 
     def ask(self, packet: bytes, answers: int = 1) -> list[bytes]:
-        """The answers to a question, at most ``answers``; fewer where some do not come in time.
+        """The answers to a request, at most ``answers``; fewer if some do not arrive in time.
 
-        Raises DriverError (``connection_lost``): the line fails, or ``lost_after`` questions in a row had too few.
+        Raises DriverError (``connection_lost``): the line fails, or ``lost_after`` consecutive requests had too few.
         """
-        self._receive()  # what came late belongs to an earlier question
+        self._receive()  # late data belong to an earlier request
         self.send(packet)
         found: list[bytes] = []
         data = b""
@@ -97,7 +97,7 @@ class HalfDuplexBus:
                 if not used:
                     break
                 data = data[used:]
-                if answer is not None and answer != packet:  # else the adapter's echo
+                if answer is not None and answer != packet:  # otherwise it is the adapter's echo
                     found.append(answer)
                     end = time.monotonic() + self._answer_s
             if not arrived:
@@ -112,7 +112,7 @@ class HalfDuplexBus:
         return found
 
     def close(self) -> None:
-        """Release the line. Errors of a line that is gone are ignored."""
+        """Release the line. Errors of a lost line are ignored."""
         with suppress(OSError):
             self._stream.close()
 

@@ -37,17 +37,17 @@ from stereoservo_drivers.kit.watchdog import StallWatch
 
 
 WIDEST_RAD, FASTEST_RAD, WIDEST_M, FASTEST_M = 16.0 * math.pi, 30.0, 20.0, 10.0
-"""Range and velocity beyond which limits look like degrees or millimetres."""
+"""Range and velocity above which limits are probably in degrees or millimetres."""
 FINEST = 0.6e-3
 """[rad or m] Encoders with coarser steps must state them."""
 GONE_S = 1.0
-"""Time for threads to end."""
+"""Time limit for threads to end."""
 
 # -- without the device ----------------------------------------------------------------------------------------
 
 
 def describes_itself(bench: JointBench) -> str:
-    """The description is there before anything connects, and makes sense; suspicious limits are told."""
+    """Check that the description is available before anything connects, and plausible; reports suspicious limits."""
     driver = bench.new()
     require(
         isinstance(driver, JointDriver),
@@ -72,7 +72,7 @@ def describes_itself(bench: JointBench) -> str:
 
 
 def _doubt(joint: JointSpec) -> str:
-    """What looks like another unit than [rad, m, s] in a joint's limits, as a text; empty: nothing."""
+    """Text on limits of a joint that seem to be in another unit than [rad, m, s]; empty if there are none."""
     revolute = joint.kind == "revolute"
     widest, fastest, unit = (WIDEST_RAD, FASTEST_RAD, "rad") if revolute else (WIDEST_M, FASTEST_M, "m")
     if joint.position_max - joint.position_min <= widest and joint.velocity_max <= fastest:
@@ -84,7 +84,7 @@ def _doubt(joint: JointSpec) -> str:
 
 
 def refuses_before_configure(bench: JointBench) -> str:
-    """Calls before configure() raise DriverError."""
+    """Check that calls before configure() raise DriverError."""
     driver = bench.new()
     codes = [
         refused(call, f"{name}() before configure()")
@@ -98,7 +98,7 @@ def refuses_before_configure(bench: JointBench) -> str:
 
 
 def stops_unconnected(bench: JointBench) -> str:
-    """stop() and close() do nothing where nothing is connected."""
+    """Check that stop() and close() do nothing if nothing is connected."""
     driver = bench.new()
     for state in ("before configure()", "after close()"):
         for _ in range(2):
@@ -111,7 +111,7 @@ def stops_unconnected(bench: JointBench) -> str:
 
 
 def keeps_its_description(bench: JointBench) -> str:
-    """The description stays the same from state to state."""
+    """Check that the description is the same in all states."""
     driver = bench.new()
     before = driver.describe()
     bench.setup.configure(driver)
@@ -122,7 +122,7 @@ def keeps_its_description(bench: JointBench) -> str:
 
 
 def refuses_unless_active(bench: JointBench) -> str:
-    """Commands are refused before activate() and after deactivate(); then it is configured and activated again."""
+    """Check that commands are refused before activate() and after deactivate(); then configure and activate again."""
     driver = bench.configured()
     codes = [refused(lambda: driver.write_velocity(zero(driver)), "write_velocity() before activate()")]
     driver.activate()
@@ -142,7 +142,7 @@ def refuses_unless_active(bench: JointBench) -> str:
 
 
 def refuses_once_closed(bench: JointBench) -> str:
-    """Calls after close() raise DriverError."""
+    """Check that calls after close() raise DriverError."""
     driver = bench.active()
     driver.close()
     driver.close()
@@ -152,7 +152,7 @@ def refuses_once_closed(bench: JointBench) -> str:
 
 
 def is_silent_once_closed(bench: JointBench) -> str:
-    """Nothing reaches the device after close()."""
+    """Check that nothing reaches the device after close()."""
     driver = bench.active()
     bench.drive(driver, bench.slow(driver), 0.05)
     driver.close()
@@ -169,8 +169,8 @@ def is_silent_once_closed(bench: JointBench) -> str:
 
 
 def leaves_nothing_behind(bench: JointBench) -> str:
-    """No threads and file descriptors are left after close()."""
-    for first in (True, False):  # what is loaded once, by the first driver, is no leak
+    """Check that no threads and file descriptors remain after close()."""
+    for first in (True, False):  # objects loaded once, by the first driver, are not a leak
         threads, files = set(threading.enumerate()), _open_files()
         driver = bench.active()
         bench.drive(driver, zero(driver), 0.05)
@@ -200,7 +200,7 @@ def _open_files() -> int:
 
 
 def numbers_its_samples(bench: JointBench) -> str:
-    """Samples are numbered, and stamped young enough for the cell."""
+    """Check that samples are numbered, and stamped recently enough for the cell."""
     driver = bench.active()
     description = driver.describe()
     period = 1.0 / description.rate_hz
@@ -222,7 +222,7 @@ def numbers_its_samples(bench: JointBench) -> str:
 
 
 def keeps_samples_apart(bench: JointBench) -> str:
-    """Samples and reports own their arrays."""
+    """Check that samples and reports own their arrays."""
     driver = bench.active()
     velocity = bench.slow(driver)
     state = bench.read(driver)
@@ -237,12 +237,12 @@ def keeps_samples_apart(bench: JointBench) -> str:
 
 
 def agrees_with_its_velocities(bench: JointBench) -> str:
-    """Velocities of the samples are the change of their positions."""
+    """Check that velocities of the samples are the change of their positions."""
     driver = bench.active()
     states = bench.drive(driver, bench.slow(driver), 0.6)
     states = states[len(states) // 2 :]
     seconds = np.diff([state.t_ns for state in states]) * 1e-9
-    # Not where this machine stood still, and the arm, too.
+    # Not if this machine, and with it the arm, was suspended.
     led = seconds < driver.describe().command_timeout_s
     elapsed = float(seconds[led].sum())
     require(elapsed > 0.0, "stamps stand still while the arm moves")
@@ -260,7 +260,7 @@ def agrees_with_its_velocities(bench: JointBench) -> str:
 
 
 def states_its_resolution(bench: JointBench) -> str:
-    """Positions change by no more than the stated resolution at a time."""
+    """Check that positions change by no more than the stated resolution at a time."""
     driver = bench.active()
     description = driver.describe()
     period = 1.0 / description.rate_hz
@@ -285,13 +285,13 @@ def states_its_resolution(bench: JointBench) -> str:
 Verdict = Literal["passed", "failed", "not run"]
 
 TRIES = 3
-"""How often a check is run at most that fails where this computer stood still meanwhile."""
+"""Largest number of runs of a check that fails while this computer was suspended."""
 STALL_S = 0.02
-"""[s] A process that wakes so much too late stood still: no check needs a reaction in less."""
+"""[s] A process that wakes up this late was suspended: no check requires a faster reaction."""
 
 
 class CheckResult(msgspec.Struct, frozen=True):
-    """Result of one check; ``remedy``: what to do where it failed."""
+    """Result of one check; ``remedy``: what to do if it failed."""
 
     name: str
     verdict: Verdict
@@ -301,7 +301,7 @@ class CheckResult(msgspec.Struct, frozen=True):
 
 @dataclass(frozen=True)
 class JointCheck:
-    """One check: ``run`` returns what it measured and raises where it fails. ``connects``: it needs the device."""
+    """One check: ``run`` returns the measured result and raises if it fails. ``connects``: it needs the device."""
 
     name: str
     run: Callable[[JointBench], str]
@@ -310,10 +310,10 @@ class JointCheck:
 
 
 def run_check(check: JointCheck, setup: JointDriverSetup, folder: Path) -> CheckResult:
-    """Run one check on drivers of its own, which are closed after it; ``folder``: an empty one.
+    """Run one check on separate drivers, which are closed after it; ``folder``: an empty one.
 
-    Where this process stood still while a check of a device in real time failed, the computer may have failed and not
-    the driver: the check runs again, unless the arm ran away.
+    If this process was suspended while a check of a device in real time failed, the computer may have caused the
+    failure and not the driver: the check runs again, unless the arm ran away.
     """
     stalls: list[float] = []
     for _ in range(TRIES):
@@ -455,6 +455,5 @@ JOINT_CHECKS = (
         "raise DriverError('connection_lost') when answers cease; catch everything in stop() and close()",
     ),
 )
-"""In the order in which they are run: those first that need no device, and those that may show that an arm must not
-move.
+"""Checks in the order of execution: first those that need no device, and those that may show that an arm must not move.
 """

@@ -24,17 +24,18 @@ from stereoservo_drivers.kit.bench import (
 )
 
 MOVED_SHARE = (0.3, 1.5)
-"""Of the commanded travel: what a joint must move at least, and at most."""
+"""Least and largest share of the commanded travel that a joint must move."""
 SLACK = 1e-3
-"""[rad or m] Beside what a bound is derived from."""
+"""[rad or m] Tolerance added to derived bounds."""
 APART = 0.02
-"""[rad or m] Between a joint's true position and that which is told, beside its steps: play, sag, noise."""
+"""[rad or m] Largest difference of a joint's true and reported positions, in addition to its resolution: play, sag,
+noise.
+"""
 LONGEST_DRIVE_S = 12.0
 REACT_S = 0.02
-"""How much later than stop() a call may take effect."""
+"""Largest delay of the effect of a call compared with stop() [s]."""
 SILENCE_S, LONGER_S = 0.2, 0.6
-"""How much longer than it may move the arm is left alone, at least, and added to it at most for joints that are slow.
-"""
+"""Waiting time beyond the allowed time of motion [s]: at least, and largest addition for slow joints."""
 CALLS = 50
 TRUTH_REMEDY = (
     "sign, zero, unit or order of the joints is wrong in commands and positions alike: the driver agrees with itself, "
@@ -43,7 +44,7 @@ TRUTH_REMEDY = (
 
 
 def stands_when_activated(bench: JointBench) -> str:
-    """configure() and activate() move nothing."""
+    """Check that configure() and activate() move nothing."""
     driver = bench.configured()
     stood = bench.settle(driver, 0.1).positions
     driver.close()
@@ -66,7 +67,9 @@ def stands_when_activated(bench: JointBench) -> str:
 
 
 def moves_as_told(bench: JointBench) -> str:
-    """Each joint moves in the commanded direction, about as far as it is commanded, and as far as the driver tells."""
+    """Check that each joint moves in the commanded direction, approximately by the commanded and by the reported
+    travel.
+    """
     driver = bench.active()
     velocity = bench.slow(driver)
     start_ns, before = bench.now_ns(), bench.read(driver).positions
@@ -75,7 +78,7 @@ def moves_as_told(bench: JointBench) -> str:
     states = bench.drive(driver, velocity, seconds)
     moved = (bench.read(driver).positions - before) * np.sign(velocity)
     truth = bench.setup.true_positions(driver)
-    elapsed = (bench.now_ns() - start_ns) * 1e-9  # more than asked for on a machine that stalls
+    elapsed = (bench.now_ns() - start_ns) * 1e-9  # more than requested on a machine that stalls
     steps = resolutions(driver)
     least = np.maximum(MOVED_SHARE[0] * seconds * np.abs(velocity) - 2.0 * steps, 1e-9)
     most = MOVED_SHARE[1] * elapsed * np.abs(velocity) + 2.0 * steps + SLACK
@@ -88,9 +91,9 @@ def moves_as_told(bench: JointBench) -> str:
 
 
 def _true_start(bench: JointBench, driver: JointDriver, told: FloatArray) -> FloatArray | None:
-    """True positions (n,) of the arm, which stands; None where nobody measures them.
+    """True positions (n,) of the arm at rest; None if they are not measured.
 
-    Raises CheckFailedError where they are not those that are ``told`` (n,).
+    Raises CheckFailedError if they differ from the reported ones, ``told`` (n,).
     """
     truth = bench.setup.true_positions(driver)
     if truth is not None:
@@ -122,9 +125,10 @@ def _reaction(states: list[JointState]) -> float:
 
 
 def _lateness(bench: JointBench, driver: JointDriver, velocity: FloatArray) -> str:
-    """How much older than their stamps positions are, by the true ones, as a text; empty where nobody measures them.
+    """Text on how much older than their stamps positions are, compared with the true ones; empty if those are not
+    measured.
 
-    Raises CheckFailedError where that is more than samples may be old.
+    Raises CheckFailedError if that exceeds the allowed age of samples.
     """
     ages = []
     for _ in range(20):
@@ -145,7 +149,7 @@ def _lateness(bench: JointBench, driver: JointDriver, velocity: FloatArray) -> s
 
 
 def cuts_velocities(bench: JointBench) -> str:
-    """Velocities beyond the limits are cut, with a reason."""
+    """Check that velocities beyond the limits are clipped, with a reason."""
     driver = bench.active()
     limits = np.array([joint.velocity_max for joint in driver.describe().joints])
     velocity = bench.slow(driver)
@@ -164,7 +168,7 @@ def cuts_velocities(bench: JointBench) -> str:
 
 
 def refuses_bad_commands(bench: JointBench) -> str:
-    """Commands of another shape, and what is not finite, are refused."""
+    """Check that commands of another shape, or with values that are not finite, are refused."""
     driver = bench.active()
     rest = zero(driver)
     codes = [refused(lambda: driver.write_velocity(np.zeros(len(rest) + 1)), "a command of another shape")]
@@ -177,7 +181,7 @@ def refuses_bad_commands(bench: JointBench) -> str:
 
 
 def stops(bench: JointBench) -> str:
-    """stop() and deactivate() bring the arm to rest."""
+    """Check that stop() and deactivate() bring the arm to rest."""
     driver = bench.active()
     velocity = bench.slow(driver)
 
@@ -204,7 +208,7 @@ def stops(bench: JointBench) -> str:
 def _travel_after(
     bench: JointBench, driver: JointDriver, velocity: FloatArray, halt: Callable[[], None], what: str
 ) -> tuple[FloatArray, float]:
-    """Travel (n,) from before the call ``halt`` of the moving arm until it rests, and how long [s] the call took."""
+    """Travel (n,) from before the call ``halt`` of the moving arm until it rests, and the duration of the call [s]."""
     bench.drive(driver, velocity, 0.2)
     before = bench.read(driver)
     halt()
@@ -215,7 +219,9 @@ def _travel_after(
 
 
 def stops_when_commands_cease(bench: JointBench) -> str:
-    """The arm comes to rest by itself when commands cease, read or not; a new command moves it again or is refused."""
+    """Check that the arm comes to rest by itself when commands cease, with or without reads; a new command moves it
+    again or is refused.
+    """
     if not bench.setup.enforces_timeout:
         raise CheckNotRunError("this device has no command time-out of its own (enforces_timeout)")
     driver = bench.active()
@@ -237,9 +243,9 @@ def stops_when_commands_cease(bench: JointBench) -> str:
 
 
 def _travel_in_silence(bench: JointBench, driver: JointDriver, velocity: FloatArray) -> tuple[float, FloatArray]:
-    """Largest travel from the last command on, with no call of the driver meanwhile, and where the joints stand (n,).
+    """Largest travel from the last command on, without any call of the driver, and the final positions (n,).
 
-    Raises CheckFailedError where that is farther than the time-out and braking explain.
+    Raises CheckFailedError if the travel exceeds that of the time-out and braking.
     """
     bench.drive(driver, velocity, 0.2)
     before, start = bench.read(driver), bench.setup.true_positions(driver)
@@ -265,7 +271,9 @@ def _travel_in_silence(bench: JointBench, driver: JointDriver, velocity: FloatAr
 def _silence(
     bench: JointBench, driver: JointDriver, velocity: FloatArray, before: JointState
 ) -> tuple[FloatArray, float]:
-    """How far (n,) joints may go from ``before``, with the last command now, and how long [s] is waited to see it."""
+    """Largest allowed travel (n,) of joints from ``before``, with the last command now, and the time to wait for it
+    [s].
+    """
     timeout, brake = driver.describe().command_timeout_s, bench.setup.brake_s
     speed, slack = np.abs(velocity), resolutions(driver) + SLACK
     elapsed = (bench.now_ns() - before.t_ns) * 1e-9
@@ -275,7 +283,9 @@ def _silence(
 
 
 def stands_once_closed(bench: JointBench) -> str:
-    """close() of a moving arm leaves it at rest: the driver stops it, or at the latest the device's time-out does."""
+    """Check that close() of a moving arm leaves it at rest, stopped by the driver or at the latest by the device's
+    time-out.
+    """
     driver = bench.active()
     velocity = bench.slow(driver)
     bench.drive(driver, velocity, 0.2)
@@ -314,9 +324,9 @@ def _settled(bench: JointBench, driver: JointDriver) -> FloatArray:
 
 
 def _recovery(bench: JointBench, driver: JointDriver, velocity: FloatArray, positions: FloatArray) -> str:
-    """What a new command does to an arm that stands at ``positions`` (n,) since commands ceased.
+    """Text on the effect of a new command on an arm at rest at ``positions`` (n,) since commands ceased.
 
-    Raises CheckFailedError where it neither moves it nor raises DriverError.
+    Raises CheckFailedError if it neither moves it nor raises DriverError.
     """
     try:
         bench.drive(driver, velocity, 0.3)
@@ -333,7 +343,7 @@ def _recovery(bench: JointBench, driver: JointDriver, velocity: FloatArray, posi
 
 
 def keeps_position_limits(bench: JointBench) -> str:
-    """A joint that is driven against its limit stays there, and comes back."""
+    """Check that a joint that is driven against its limit stops there, and returns."""
     allowed_here = bench.setup.whole_range
     if not (not bench.setup.real_time if allowed_here is None else allowed_here):
         raise CheckNotRunError("drives every joint to a limit: whole_range, `--whole-range`")
@@ -372,7 +382,7 @@ def keeps_position_limits(bench: JointBench) -> str:
 
 
 def orders_auxiliary(bench: JointBench) -> str:
-    """Auxiliary joints go where they are ordered, and stop."""
+    """Check that auxiliary joints move to commanded positions, and stop."""
     driver = bench.active()
     specs = driver.describe().auxiliary
     if not specs:
@@ -394,7 +404,7 @@ def orders_auxiliary(bench: JointBench) -> str:
         stopped = driver.read_auxiliary()
         bench.settle(driver, 0.3)
         after = driver.read_auxiliary()
-    finally:  # a stop leaves outputs switched
+    finally:  # outputs remain switched after a stop
         outputs = {spec.name: before[spec.name] for spec in specs if spec.kind == "digital"}
         if outputs:
             driver.write_auxiliary(outputs)
@@ -412,7 +422,7 @@ def orders_auxiliary(bench: JointBench) -> str:
 
 
 def answers_in_time(bench: JointBench) -> str:
-    """Calls take no longer than stated, and both fit into a cycle."""
+    """Check that calls take no longer than stated, and both fit into a cycle."""
     driver = bench.active()
     description = driver.describe()
     period, velocity = 1.0 / description.rate_hz, bench.slow(driver)
@@ -445,21 +455,23 @@ def answers_in_time(bench: JointBench) -> str:
 
 
 def tells_faults_of_the_device(bench: JointBench) -> str:
-    """A fault of the device is told by DriverError; once it is mended, the driver is configured and activated again."""
+    """Check that a fault of the device raises DriverError; after its repair the driver is configured and activated
+    again.
+    """
     driver = bench.active()
     missing = "nobody makes the device fail (protective stop, hardware error): break_down()"
     setup = bench.setup
     with _failed(bench, driver, setup.break_down, setup.mend, missing, "the device has a fault") as told:
         call_stop(driver, "with a fault of the device")
         driver.deactivate()
-    setup.configure(driver)  # as the command `reset` does
+    setup.configure(driver)  # as by the command `reset`
     driver.activate()
     bench.drive(driver, zero(driver), 0.05)
     return f"{told}; mended, it is configured and activated again"
 
 
 def reports_a_lost_device(bench: JointBench) -> str:
-    """A device that has gone is told by DriverError, and stop() and close() raise nothing then."""
+    """Check that a lost device raises DriverError, and that stop() and close() then raise nothing."""
     driver = bench.active()
     missing = "nobody pulls the cable: override unplug(), or `--pull`"
     setup = bench.setup
@@ -479,9 +491,10 @@ def _failed(
     missing: str,
     since: str,
 ) -> Iterator[str]:
-    """The arm in motion while its device fails, until the failure is undone; gives what the driver told, and when.
+    """Context manager with the arm in motion while its device fails, until the failure is undone; yields the reported
+    code and its delay as text.
 
-    Raises CheckNotRunError with what is ``missing``, CheckFailedError.
+    Raises CheckNotRunError with the ``missing`` function, CheckFailedError.
     """
     velocity, period = bench.slow(driver), 1.0 / driver.describe().rate_hz
     bench.drive(driver, velocity, 0.1)

@@ -1,9 +1,9 @@
-"""Poses of a tool as positions of six virtual joints: three that slide, three that turn.
+"""Poses of a tool as positions of six virtual joints: three prismatic, three revolute.
 
-An arm that takes Cartesian velocities is, for all that is above the driver, an arm of six joints whose product of
+An arm commanded by Cartesian velocities is, for everything above the driver, an arm of six joints whose product of
 exponentials is exact: ``T = Tx(x) Ty(y) Tz(z) A Rx(c) Ry(b) Rz(a)``, base from tool, the tool's point at (x, y, z) in
-the base frame, ``A`` an attitude about which the angles are counted. They are singular at b = ±90°; the tool's own z,
-about which tools turn farthest, is the last axis and free.
+the base frame, ``A`` an attitude, the zero of the angles. They are singular at b = ±90°; the tool's own z, about which
+tools turn farthest, is the last axis and unlimited.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from stereoservo.ports.devices import DriverError, JointSpec
 
 NAMES = ("x", "y", "z", "turn_x", "turn_y", "turn_z")
 STEEPEST = float(np.radians(80.0))
-"""Largest tilt b [rad]: beyond it the other two turns are nearly one."""
+"""Largest tilt b [rad]: beyond it the axes of the other two turns are nearly parallel."""
 
 
 class VirtualLimits(NamedTuple):
@@ -32,9 +32,7 @@ class VirtualLimits(NamedTuple):
     accelerations: tuple[float, float]
 
     def joints(self) -> tuple[JointSpec, ...]:
-        """The six joints. Raises DriverError (``option``) for an empty box, and for turns that come to the
-        singularity.
-        """
+        """The six joints. Raises DriverError (``option``) for an empty box, or turns that reach the singularity."""
         if not all(low < high for low, high in zip(self.low, self.high, strict=True)):
             raise DriverError(
                 "option", f"the tool's box {self.low} to {self.high} [m] is empty; low below high is valid"
@@ -66,7 +64,7 @@ def turn(vector: FloatArray) -> FloatArray:
 
 
 def positions_of(pose: FloatArray, attitude: FloatArray, near: FloatArray) -> FloatArray:
-    """Virtual joints (6,) of a pose (4, 4); of turns that differ by whole ones those nearest to ``near`` (6,).
+    """Virtual joints (6,) of a pose (4, 4); of turns that differ by full turns, those nearest to ``near`` (6,).
 
     ``attitude`` (3, 3): A. Raises DriverError (``attitude``) beyond `STEEPEST`.
     """
@@ -101,5 +99,5 @@ def twist_of(positions: FloatArray, velocities: FloatArray, attitude: FloatArray
 
 
 def velocities_of(positions: FloatArray, v: FloatArray, w: FloatArray, attitude: FloatArray) -> FloatArray:
-    """Virtual velocities (6,) of a twist, as `twist_of`."""
+    """Virtual velocities (6,) of a twist, the inverse of `twist_of`."""
     return np.concatenate([v, np.linalg.solve(turning_axes(positions, attitude), w)])

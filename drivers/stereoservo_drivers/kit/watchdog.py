@@ -1,8 +1,8 @@
-"""Threads that watch the time: one stops a device when commands cease, one notes where its own process stood still.
+"""Threads that monitor time: one stops a device when commands cease, one detects when its own process was suspended.
 
-The watchdog is for devices that go on with the last command for ever. It serves a servo process that hangs, and ends
-with it: a device without a watchdog of its own then goes on, which nothing in this computer can help. Take positions
-within a lead (`position_output`) where the device has them.
+The watchdog is for devices that continue with the last command indefinitely. It protects against a servo process that
+hangs, but ends with that process: a device without a watchdog of its own then continues, which nothing in this computer
+can prevent. Use positions within a lead (`position_output`) if the device has them.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from types import TracebackType
 from typing import Self
 
 LOOKS = 5
-"""How often in a time-out the watchdog looks."""
+"""Number of checks of the watchdog per time-out."""
 SLEEP_S = 0.01
-"""Between two looks at the time of :class:`StallWatch`."""
+"""Interval between two checks of :class:`StallWatch` [s]."""
 
 
 class CommandWatchdog:
-    """Calls ``stop`` once where ``feed`` was not called for ``timeout_s``, from a thread of its own.
+    """Calls ``stop`` once if ``feed`` was not called for ``timeout_s``, from a separate thread.
 
-    ``stop`` must not raise, and must be safe beside the driver's own calls. ``expired``: commands have ceased; fed
-    again, it begins anew.
+    ``stop`` must not raise, and must be safe concurrently with the driver's own calls. ``expired``: commands have
+    ceased; fed again, it restarts.
     """
 
     def __init__(self, timeout_s: float, stop: Callable[[], None]) -> None:
@@ -36,12 +36,12 @@ class CommandWatchdog:
         self._thread.start()
 
     def feed(self) -> None:
-        """A command was sent."""
+        """Record that a command was sent."""
         self._fed_s = time.monotonic()
         self.expired = False
 
     def close(self) -> None:
-        """End the thread; ``stop`` is not called any more. Idempotent."""
+        """End the thread; ``stop`` is no longer called. Idempotent."""
         self._ended.set()
         self._thread.join()
 
@@ -53,8 +53,8 @@ class CommandWatchdog:
 
 
 class StallWatch:
-    """A thread that only sleeps, and notes by how much it came late at most, ``longest_s`` [s]: then its process got no
-    processor, or another thread kept the interpreter. A context manager that ends it.
+    """A thread that only sleeps, and records its largest delay, ``longest_s`` [s]: then its process was not scheduled,
+    or another thread held the interpreter. A context manager that ends it.
     """
 
     def __init__(self) -> None:

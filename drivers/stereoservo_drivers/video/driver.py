@@ -40,7 +40,7 @@ from stereoservo_drivers.video.stream_monitor import Watch
 
 LIVE_BUDGET_US = 1000.0
 RECORDED_BUDGET_US = 50_000.0
-"""A poll of a recording decodes what is due in the caller's own thread."""
+"""Call budget: a poll of a recording decodes due frames in the caller's own thread."""
 
 
 class Feed(Protocol):
@@ -71,10 +71,10 @@ class Feed(Protocol):
 class VideoCameraDriver:
     """One camera. Options: :class:`~stereoservo_drivers.video.options.VideoOptions`.
 
-    It does not reconnect by itself: a source that fails raises DriverError from :meth:`poll`, and who holds the driver
-    closes it and configures it again, which reopens the source (an old `cv2.VideoCapture` never recovers). Counts,
-    numbers of frames and the last picture, by which a frozen camera is known, go on over that. A recording that is over
-    or damaged stays so: configured again, it raises the same error and does not restart.
+    It does not reconnect by itself: a source that fails raises DriverError from :meth:`poll`, and the owner of the
+    driver closes it and configures it again, which reopens the source (an old `cv2.VideoCapture` never recovers).
+    Counts, frame numbers and the last picture, by which a frozen camera is detected, are kept. A recording that has
+    ended or is damaged remains so: configured again, it raises the same error and does not restart.
     """
 
     def __init__(self, options: Mapping[str, Any], context: DriverContext) -> None:
@@ -105,7 +105,7 @@ class VideoCameraDriver:
     @classmethod
     def find_cameras(cls) -> tuple[FoundCamera, ...]:
         """V4L2 cameras of this computer."""
-        pass  # for `stereoservo setup` alone
+        pass  # only for `stereoservo setup`
 
         return found_cameras()
 
@@ -119,7 +119,7 @@ class VideoCameraDriver:
     def configure(self) -> None:
         """Open the source and receive a first image, within ``open_timeout_s``; also after :meth:`close`.
 
-        Raises DriverError: what is wrong with the source, ``image_size``, ``open_timeout``, ``end_of_file``.
+        Raises DriverError: the source's error, ``image_size``, ``open_timeout``, ``end_of_file``.
         """
         self._life.require("configure()", LifecycleState.CREATED, LifecycleState.CONFIGURED, LifecycleState.CLOSED)
         if self._life.state is LifecycleState.CONFIGURED:
@@ -137,7 +137,7 @@ class VideoCameraDriver:
         self._life.state = LifecycleState.CONFIGURED
 
     def _check_arm(self) -> None:
-        """Raises DriverError where the cell's joints are played back from an episode that this camera is not with."""
+        """Raise DriverError if the cell's joints are played back from an episode without this camera."""
         arm, options, place = self._context.arm, self._options, self._place
         if place.kind != "episode" or "dataset" not in arm:
             return
@@ -180,7 +180,7 @@ class VideoCameraDriver:
         return [] if frame is None else [frame]
 
     def deactivate(self) -> None:
-        """Stop delivery; the source stays open. Idempotent."""
+        """Stop delivery; the source remains open. Idempotent."""
         if self._life.state is LifecycleState.ACTIVE:
             self._life.state = LifecycleState.CONFIGURED
 
@@ -193,7 +193,7 @@ class VideoCameraDriver:
         self._life.state = LifecycleState.CLOSED
 
     def statistics(self) -> CameraStatistics:
-        """Counts since the driver was first configured, over reconnections; any state."""
+        """Counts since the driver was first configured, including reconnections; any state."""
         watch = self._watch
         return CameraStatistics(
             frames=watch.frames,
@@ -210,7 +210,7 @@ def _again(error: DriverError) -> DriverError:
 
 
 # -- discovery -----------------------------------------------------------------------------------------------
-# Discovery of cameras: V4L2 devices of this computer, their picture sizes and rates; what a source delivers.
+# Discovery of cameras: V4L2 devices of this computer, their picture sizes and rates; pictures of a source.
 
 
 CLASS = Path("/sys/class/video4linux")
@@ -218,19 +218,19 @@ BY_ID = Path("/dev/v4l/by-id")
 DEVICES = Path("/dev")
 QUERYCAP, ENUM_FMT = 0x80685600, 0xC0405602
 ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0xC02C564A, 0xC034564B
-"""Requests of Linux' videodev2.h; the size of the structure is in them."""
+"""Requests of Linux' videodev2.h; the size of the structure is part of them."""
 CAPTURE = 1
 """``V4L2_BUF_TYPE_VIDEO_CAPTURE``, and ``V4L2_CAP_VIDEO_CAPTURE``."""
 DISCRETE = 1
 LARGEST_PIXELS = 2_000_000
-"""Larger pictures cost more time than they bring, and are not proposed first."""
+"""Larger pictures cost more time than they are worth, and are not proposed first."""
 LEAST_RATE_HZ = 10.0
 PROBED_PICTURES = 12
 USUAL_RATES = (5.0, 7.5, 10.0, 15.0, 20.0, 24.0, 25.0, 30.0, 50.0, 60.0, 90.0, 100.0, 120.0)
 NEAR = 0.12
 
 Ioctl = Callable[[int, bytearray], None]
-"""Fills a structure by a request; raises OSError where the list has ended."""
+"""Fills a structure by a request; raises OSError at the end of the list."""
 Mode = tuple[int, int, float]
 
 
@@ -240,10 +240,10 @@ def found_cameras(
     devices: Path = DEVICES,
     asked: Callable[[Path], tuple[Mode, ...] | None] | None = None,
 ) -> tuple[FoundCamera, ...]:
-    """V4L2 cameras, in the order of their numbers, by the link that stays theirs where they have one.
+    """V4L2 cameras, in the order of their numbers, by their persistent link if they have one.
 
-    ``directory``: the kernel's; ``links``: udev's names of devices; ``asked``: a device's modes, None where it captures
-    no pictures (cameras have such devices for their metadata).
+    ``directory``: the kernel's; ``links``: udev's names of devices; ``asked``: a device's modes, None if it captures no
+    pictures (cameras have such devices for their metadata).
     """
     asked = device_modes if asked is None else asked
     stable = {}
@@ -265,7 +265,7 @@ def found_cameras(
 
 
 def device_modes(device: Path) -> tuple[Mode, ...] | None:
-    """Modes of a V4L2 device, best first; None where it cannot be opened or captures no pictures."""
+    """Modes of a V4L2 device, best first; None if it cannot be opened or captures no pictures."""
     try:
         descriptor = os.open(device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:
@@ -277,7 +277,7 @@ def device_modes(device: Path) -> tuple[Mode, ...] | None:
 
 
 def modes_told(ioctl: Ioctl) -> tuple[Mode, ...] | None:
-    """Modes that a device tells by V4L2's requests, best first; None where it captures no pictures."""
+    """Modes that a device reports by V4L2's requests, best first; None if it captures no pictures."""
     about = bytearray(104)
     try:
         ioctl(QUERYCAP, about)
@@ -346,18 +346,18 @@ def probed(options: Mapping[str, Any]) -> Mode:
 
 
 def usual_rate(rate_hz: float) -> float:
-    """The usual rate of cameras next to a measured one, or that one rounded down where none is near."""
+    """The usual camera rate nearest to a measured one, or the measured one rounded down if none is near."""
     near = min(USUAL_RATES, key=lambda usual: abs(usual - rate_hz))
     return near if abs(near - rate_hz) <= NEAR * near else float(max(int(rate_hz), 1))
 
 
 # -- the reader's thread -------------------------------------------------------------------------------------
-# Live cameras: the source by the kind of its place, and the thread that waits for its images and keeps the newest.
+# Live cameras: the source by the kind of its place, and the thread that waits for its images and stores the newest.
 
 
 JOIN_S = 0.5
-"""How long :meth:`Reader.close` waits for its thread. One that hangs in a library is left to end by itself; it is a
-daemon, and nothing that it still receives gets out.
+"""Time that :meth:`Reader.close` waits for its thread [s]. A thread that hangs in a library is abandoned; it is a
+daemon, and anything it still receives is discarded.
 """
 
 
@@ -366,7 +366,7 @@ def live_source(
 ) -> LiveSource:
     """A source for a ``place`` that delivers images by itself; not connected yet.
 
-    ``server_clock``: what is known of the clock of an MJPEG stream's server; None: its stamps are not used.
+    ``server_clock``: clock estimate of an MJPEG stream's server; None: its stamps are not used.
     """
     if place.kind == "http":
         return MjpegSource(place, options, clock, server_clock)
@@ -376,7 +376,7 @@ def live_source(
 
 
 class Reader:
-    """Reads ``source``, which must be unused, in a thread of its own. Every wait of its callers is bounded."""
+    """Reads ``source``, which must be unused, in a separate thread. Every wait of its callers is bounded."""
 
     def __init__(self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: Watch) -> None:
         self.abandoned = False
@@ -437,7 +437,7 @@ class Reader:
         return None
 
     def close(self) -> None:
-        """End the thread, or abandon it where it hangs. Idempotent; never raises."""
+        """End the thread, or abandon it if it hangs. Idempotent; never raises."""
         with self._changed:
             self._ending = True
             self._newest = None
@@ -479,7 +479,7 @@ class Reader:
                 image, picture.t_received_ns, picture.seq, picture.skipped, look=self._frozen_frames > 0
             )
             if fresh:
-                # Two pictures that came with one read have one time; in order all the same.
+                # Two pictures from one read have the same time; increasing stamps all the same.
                 received_ns = max(picture.t_received_ns, self._after_ns)
                 self._after_ns = received_ns + 1
                 known_ns = picture.t_shutter_ns

@@ -1,7 +1,7 @@
-"""MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the time at which it began to arrive.
+"""MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the arrival time of its first byte.
 
-A reader of our own, since it stamps a picture when its first byte arrives, reads the server's number of it, and detects
-a JPEG that was cut off: decoders behind `cv2.VideoCapture` report neither and invent times.
+A custom reader, since it stamps a picture when its first byte arrives, reads the server's number of it, and detects a
+truncated JPEG: decoders behind `cv2.VideoCapture` report neither and invent times.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class MjpegSource:
         self._interrupted = False
         self._over = False
         self._spoiled = 0
-        self._handshake_ns: int | None = None  # of TCP, with the last server asked: there and back once
+        self._handshake_ns: int | None = None  # of TCP, with the last server: one round trip
 
     def open(self) -> None:
         """Connect and read the response's head. Raises DriverError."""
@@ -65,7 +65,7 @@ class MjpegSource:
                 break
             target = self._sent_on(url, response.getheader("Location", ""))
             response.close()
-            if target.hostname == url.hostname and not target.username:  # the password is that host's
+            if target.hostname == url.hostname and not target.username:  # the password belongs to that host
                 target = target._replace(netloc=url.netloc.rpartition("@")[0] + "@" + target.netloc)
             url = target
         else:
@@ -183,8 +183,8 @@ class MjpegSource:
         return self._decoded(parts[-1], len(parts) - 1) if parts else None
 
     def _received(self) -> bytes:
-        """Bytes behind the head as the connection has them, one wait at most; none: its end. What `http.client` read
-        with the head comes first.
+        """Bytes after the head as received from the connection, with at most one wait; none: its end. Data that
+        `http.client` read with the head come first.
         """
         assert self._response is not None
         return self._response.fp.read1(CHUNK)
@@ -229,7 +229,7 @@ class MjpegSource:
         self._interrupted = True
         connection = self._socket
         if connection is not None:
-            with suppress(OSError):  # closed by the other side, or by the thread: nothing waits any more
+            with suppress(OSError):  # closed by the other side, or by the thread: nothing is waiting any more
                 connection.shutdown(socket.SHUT_RDWR)
 
     def release(self) -> None:
@@ -245,8 +245,8 @@ def _target(url: SplitResult) -> str:
 
 
 def authorization(url: SplitResult, challenge: str = "") -> str:
-    """Authorization header for the user in ``url``: Basic, or Digest where the server's ``challenge`` requires it
-    (RFC 7617, 7616), letters beyond ASCII as UTF-8.
+    """Authorization header for the user in ``url``: Basic, or Digest if the server's ``challenge`` requires it (RFC
+    7617, 7616), letters beyond ASCII as UTF-8.
     """
     user, password = unquote_to_bytes(url.username or ""), unquote_to_bytes(url.password or "")
     if not challenge:
@@ -260,7 +260,7 @@ def authorization(url: SplitResult, challenge: str = "") -> str:
 
 
 class _Digest(urllib.request.AbstractDigestAuthHandler):
-    """Python's, with user and password as bytes in the form of Latin-1: it takes ASCII alone."""
+    """Python's class, with user and password as bytes in the form of Latin-1: it accepts only ASCII."""
 
     def get_algorithm_impls(self, algorithm: str) -> tuple[Callable[[str], str], Callable[[str, str], str]]:
         digest = {"MD5": hashlib.md5, "SHA": hashlib.sha1}.get(algorithm.upper())
@@ -293,8 +293,8 @@ def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
 # -- chunked bodies ------------------------------------------------------------------------------------------
 # Incremental decoder of HTTP's chunked transfer coding (RFC 9112, 7.1).
 #
-# A decoder of our own, since that of `http.client` waits, once it has taken the line end behind a chunk, for the size
-# of the next one: a picture that is there would be held back until the following one begins.
+# A custom decoder, since that of `http.client`, after the line end behind a chunk, waits for the size of the next one:
+# a complete picture would be delayed until the following one starts.
 
 
 LONGEST_LINE = 4096
@@ -302,7 +302,7 @@ LONGEST_LINE = 4096
 
 
 class ChunkedDecoder:
-    """Takes the bytes of a chunked body as they arrive. ``ended``: its last chunk has come."""
+    """Decodes the bytes of a chunked body as they arrive. ``ended``: its last chunk has arrived."""
 
     def __init__(self) -> None:
         self.ended = False
@@ -354,7 +354,7 @@ LARGEST_PART = 50_000_000
 LONGEST_HEADERS = 16384
 _JPEG_END = b"\xff\xd9"
 _HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
-"""An empty line; the first, where a part has no headers."""
+"""An empty line; the first one if a part has no headers."""
 
 
 class MultipartError(Exception):
@@ -378,12 +378,12 @@ class MultipartPart:
 class MultipartParser:
     """Parses bytes as they arrive into whole parts. Resynchronises after a part of wrong length.
 
-    A JPEG picture without a stated length is complete with its end marker: the boundary behind it may be sent with the
-    next picture only.
+    A JPEG picture without a stated length is complete with its end marker: the boundary after it may be sent only with
+    the next picture.
     """
 
     def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
-        # Half of the servers write the boundary's leading "--" into the header already: both end in this.
+        # Half of the servers include the boundary's leading "--" in the header: both forms give this.
         self._delimiter = b"--" + boundary.encode("latin-1").lstrip(b"-")
         self._largest = largest
         self._buffer = bytearray()
@@ -484,5 +484,5 @@ class MultipartParser:
 
 
 def number_in(text: str | None) -> int | None:
-    """The number in a header; None where there is none."""
+    """The number in a header; None if there is none."""
     return int(text) if text is not None and text.isascii() and text.isdigit() and len(text) < 19 else None

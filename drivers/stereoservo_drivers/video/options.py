@@ -42,33 +42,36 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     """Options of a camera of the driver ``video``.
 
     ``source``: device number or path, video file, numbered pictures (one ``%04d`` in the file's name), or URL; files
-    are looked for in the directory of the cell file. ``width``, ``height`` [px]: asked of a device, and checked
-    against the first picture of any source. ``rate_hz``: asked of a device; the grid on which missing frames are
-    counted; the rate of files that carry no stamps. ``latency_s``: from the shutter to the reception, subtracted from
-    the time of reception (recordings with stamps of their own carry it already). ``pixel_format``: four letters
-    such as ``MJPG``, which many USB cameras need for their full rate.
+    are relative to the cell file's directory.
+    ``width``, ``height`` [px]: requested from a device, and compared with the first picture of any source.
+    ``rate_hz``: requested from a device; grid on which missing frames are counted; rate of files without stamps.
+    ``latency_s``: from the shutter to the reception, subtracted from the time of reception (recordings with stamps
+    already include it).
+    ``pixel_format``: four letters such as ``MJPG``, which many USB cameras need for their full rate.
 
-    Controls of a device (V4L2, GenICam), each left alone where it is not stated, and read back: ``exposure`` [0.1 ms
-    with UVC cameras, µs with GenICam], ``gain`` [GenICam: dB] and ``focus`` in units of the device, ``white_balance``
-    [K]; a number locks it, ``"auto"`` lets the camera choose. ``power_line_hz``: the flicker filter, 0 for none.
+    Controls of a device (V4L2, GenICam), each unchanged if it is not stated, and read back: ``exposure`` [0.1 ms with
+    UVC cameras, µs with GenICam], ``gain`` [GenICam: dB] and ``focus`` in units of the device, ``white_balance`` [K]; a
+    number locks it, ``"auto"`` lets the camera choose. ``power_line_hz``: the flicker filter, 0 for none.
     ``rate_priority``: automatic exposure must not lower the frame rate.
 
-    ``channel``: gray, or one colour's own. ``flip``: how the picture is turned before anything sees it.
-    ``open_timeout_s``: from connecting to the first picture. ``read_timeout_s``: without a picture for so long the
-    camera is silent. ``frozen_frames``: so many pictures without any change are a frozen camera, each of which is
-    withheld, from the first on; 0 looks for none (default: 10, and 0 for files).
+    ``channel``: gray, or a single colour.
+    ``flip``: rotation or mirroring of the picture before any processing.
+    ``open_timeout_s``: from connecting to the first picture.
+    ``read_timeout_s``: time without a picture after which the camera counts as silent.
+    ``frozen_frames``: number of identical pictures that count as a frozen camera, each of which is withheld, from the
+    first on; 0 disables the check (default: 10, and 0 for files).
 
-    Of an MJPEG stream: ``server_clock_s``: the pictures' own stamps (header ``X-Timestamp``, seconds of the server's
-    clock) count while that clock is known to this standard deviation [s]; else, and where it is left out, the time of
-    reception less ``latency_s`` does.
+    ``server_clock_s``: of an MJPEG stream: the pictures' own stamps (header ``X-Timestamp``, seconds of the server's
+    clock) are used while that clock's standard deviation is at most this [s]; otherwise, and if it is omitted, the time
+    of reception minus ``latency_s`` is used.
 
-    Of files and pictures: ``start``, number of the first picture used; ``loop``, begin again at the end;
-    ``pace``: ``recorded``, each at its time since delivery began (of this camera: several are not aligned), or
-    ``every``, the next one at each poll, with the recording's own stamps.
+    Of files and pictures: ``start``, number of the first picture used; ``loop``, restart at the end; ``pace``:
+    ``recorded``, each at its time since delivery started (of this camera: several are not aligned), or ``every``, the
+    next one at each poll, with the recording's own stamps.
 
     Of a LeRobot data set, whose folder is the ``source``: ``episode``, and ``feature``, the camera's name there or the
-    whole feature (default: the name of the cell's camera). With ``loop`` its times are those of
-    `episodes.Episode`, which cameras and joints of one episode share.
+    whole feature (default: the name of the cell's camera). With ``loop`` its times are those of `episodes.Episode`,
+    which are common to cameras and joints of one episode.
     """
 
     source: int | str
@@ -102,7 +105,7 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 @dataclass(frozen=True)
 class Place:
-    """A parsed ``source``. ``shown``: for messages; of a URL an `Address`."""
+    """A parsed ``source``. ``shown``: for messages; for a URL an `Address`."""
 
     kind: SourceKind
     shown: str
@@ -121,7 +124,7 @@ class Place:
 
 
 def decode_video_options(options: Mapping[str, Any], cell_dir: Path) -> tuple[VideoOptions, Place]:
-    """Options and the source they name; nothing is opened. Raises DriverError (``option``)."""
+    """Options and the parsed source; nothing is opened. Raises DriverError (``option``)."""
     decoded = decode_options(VideoOptions, options, DRIVER)
     place = _place(decoded, cell_dir)
     if place.live:
@@ -160,7 +163,7 @@ def frozen_frames(options: VideoOptions, place: Place) -> int:
 
 
 def _place(options: VideoOptions, cell_dir: Path) -> Place:
-    """The source; an episode's folder needs no ending. Raises DriverError."""
+    """The source; an episode's folder needs no file extension. Raises DriverError."""
     source = options.source
     if options.episode is None:
         if options.feature:

@@ -1,4 +1,4 @@
-"""Image operations: size check, extraction of one channel, rotation; check that JPEG data are whole."""
+"""Image operations: size check, extraction of one channel, rotation; check that JPEG data are complete."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
 PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-"""How picture files are decoded: gray ones as they are, others in colour, which :func:`one_channel` rounds properly."""
+"""Decoder flag for picture files: gray ones unchanged, others in colour, which :func:`one_channel` rounds properly."""
 
 
 def jpeg_flag(channel: Channel) -> int:
@@ -26,8 +26,8 @@ def jpeg_flag(channel: Channel) -> int:
 
 
 def one_channel(image: ImageArray, channel: Channel, flip: Flip) -> ImageArray:
-    """One channel ``(height, width)`` of ``image`` ``(height, width[, 3])``, blue first; contiguous. Of a gray
-    image any channel.
+    """One channel ``(height, width)`` of ``image`` ``(height, width[, 3])``, blue first; contiguous. Any channel of a
+    gray image is the image.
     """
     if image.ndim == 3:
         if channel == "gray":
@@ -57,10 +57,10 @@ def size_error(place: Place, options: VideoOptions, width: int, height: int) -> 
 
 
 def jpeg_size(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Width and height of JPEG data that are whole (begin marker, frame header, end marker after it), or None.
+    """Width and height of complete JPEG data (begin marker, frame header, end marker after it), or None.
 
-    Decoders fill up what is missing without a word. Cameras may pad behind the end; within coded data no end marker can
-    stand, and that of a thumbnail stands before the frame header. ITU-T T.81, B.1.
+    Decoders silently fill in missing data. Cameras may pad after the end; within coded data there is no end marker, and
+    that of a thumbnail is before the frame header. ITU-T T.81, B.1.
     """
     if data[:2] != b"\xff\xd8":
         return None

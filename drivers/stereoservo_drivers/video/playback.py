@@ -24,13 +24,13 @@ from stereoservo_drivers.video.sources import Settings
 from stereoservo_drivers.video.stream_monitor import Watch
 
 MOST_A_POLL = 8
-"""Frames that one poll passes over when it comes late: a bound of its time."""
+"""Largest number of frames that a late poll skips: bounds its time."""
 
 
 class Playback:
-    """Frames of a recording at their times; the first one is due when delivery begins.
+    """Frames of a recording at their times; the first one is due when delivery starts.
 
-    With pace ``every`` each poll gives the next frame with the recording's own stamps, whatever the clock's time.
+    With pace ``every`` each poll returns the next frame with the recording's own stamps, at any time.
     """
 
     def __init__(self, place: Place, options: VideoOptions, camera: str, watch: Watch, clock: Clock) -> None:
@@ -61,8 +61,8 @@ class Playback:
         return first
 
     def begin(self) -> None:
-        """Start delivery: the next frame is due now; of an episode that is played again and again, the one that the
-        clock's time is of. Raises DriverError.
+        """Start delivery: the next frame is due now; for an episode in repeated playback, the one at the clock's time.
+        Raises DriverError.
         """
         if self._coming is None or self._options.pace != "recorded":
             return
@@ -95,7 +95,7 @@ class Playback:
         return found
 
     def _seen(self, coming: Frame) -> Frame | None:
-        """The frame to deliver; None where it repeats the last image."""
+        """The frame to deliver; None if it repeats the last image."""
         image = one_channel(coming.image, self._options.channel, self._options.flip)
         watch = self._watch
         if not watch.see(image, coming.t_received_ns, coming.seq, 0, look=self._look > 0):
@@ -299,7 +299,7 @@ class StampedVideo:
 
 
 class NumberedPictures:
-    """Image files numbered without a gap; stamps as those of :class:`PlainVideo`."""
+    """Image files numbered without a gap; stamps as for :class:`PlainVideo`."""
 
     def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
         self._place = place
@@ -364,7 +364,7 @@ class NumberedPictures:
 class EpisodePictures:
     """Pictures of one camera of an episode of a LeRobot data set; stamps are the data set's, from 0 on.
 
-    ``period_ns``: after which the episode begins again, if it does.
+    ``period_ns``: time after which the episode restarts, if it does.
     """
 
     def __init__(self, place: Place, options: VideoOptions, camera: str) -> None:
@@ -387,7 +387,7 @@ class EpisodePictures:
         return self.read_from(0)
 
     def read_from(self, t_ns: int) -> Frame | None:
-        """The next frame from a time [ns] on; None where there is none. Raises DriverError."""
+        """The next frame from a time [ns] on; None if there is none. Raises DriverError."""
         with refused(self._place.shown):
             for row, decoded in self._pictures:
                 received_ns = int(self._episode.stamps_ns[row])

@@ -1,5 +1,5 @@
-"""The clock of a camera's server on another host: its offset and drift, estimated with their uncertainty from stamps
-that its pictures carry, and refused where they are not known well enough.
+"""The clock of a camera's server on another host: its offset and drift, estimated with their uncertainty from stamps of
+its pictures, and refused if they are not known well enough.
 """
 
 from __future__ import annotations
@@ -12,27 +12,31 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray
 
 BIN_NS, BINS = 1_000_000_000, 60
-"""The picture that came through fastest is kept of each second, and so many seconds."""
+"""Interval in which the picture with the shortest delay is stored, and number of stored intervals."""
 LEAST_BINS = 5
 WORST_DRIFT = 5e-4
-"""Clocks that run apart by more are none: a quartz has 1e-4 at most."""
+"""Largest relative drift of valid clocks: a quartz has 1e-4 at most."""
 EARLY_NS, LATE_NS, DEVIATIONS = 1_000_000, 1_000_000, 8.0
-"""A picture that comes so much before its clock lets it, and so many deviations, is stamped by a clock that was set; so
-are pictures of which the fastest of the last `RECENT` comes so much after."""
+"""If a picture arrives earlier than its stamp allows by this, and by so many deviations, its clock was set; the same
+holds if the fastest of the last `RECENT` pictures is later by this.
+"""
 RECENT, OF_RECENT, OF_ONE = 10, 3.0, 20.0
-"""How many mean delays the fastest of the recent, and one alone, may come after: that one's stamp is not believed."""
+"""Numbers of mean delays by which the fastest recent picture, and a single one, may be late: beyond it, its stamp is
+not used.
+"""
 LATE_S = 3.0
-"""All pictures of so many seconds are later: the clock was set back, or the way has become longer."""
+"""Time [s] during which all pictures are late before the clock counts as set back, or the transmission as slower."""
 LATEST_NS = 1 << 62
-"""Of a stamp: the year 2116."""
+"""Largest stamp: the year 2116."""
 HELD_NS = 15_000_000_000
-"""After that neither is known; so long the stamps are refused, until the way has been as it is."""
+"""Time [ns] without use of stamps after such a change, until the transmission is known again."""
 
 
 @dataclass(frozen=True)
 class ClockEstimate:
-    """``offset_ns``: this computer's time less the server's, at the server's ``at_ns``; ``drift``: its change, s/s;
-    ``deviation_ns``: its standard deviation; ``known``: whether it may be used, else ``reason`` says why not.
+    """Estimate of a server's clock. ``offset_ns``: this computer's time minus the server's, at the server's ``at_ns``;
+    ``drift``: its change, s/s; ``deviation_ns``: its standard deviation; ``known``: whether it may be used, else
+    ``reason`` is the cause.
     """
 
     offset_ns: int
@@ -44,7 +48,7 @@ class ClockEstimate:
 
     @property
     def told(self) -> tuple[bool, str]:
-        """Whether it is known, and what is, in words."""
+        """Whether the clock is known, and a description."""
         if not self.known:
             return False, self.reason
         return True, (
@@ -57,11 +61,11 @@ UNKNOWN = ClockEstimate(0, 0.0, math.inf, 0, False, "no picture has carried a st
 
 
 class ServerClock:
-    """Estimates a server's clock from the lower envelope of reception less stamp: a straight line below all pictures,
-    which those that came through fastest lie on (Moon, Skelly and Towsley 1999).
+    """Estimates a server's clock from the lower envelope of reception minus stamp: a straight line below all pictures,
+    through those with the shortest delay (Moon, Skelly and Towsley 1999).
 
-    The fastest took some time as well. The least time in which the server answers bounds it: half of that is taken off,
-    and an even distribution over all of it, to ways of unlike length there and back, is part of the deviation.
+    The shortest delay is not zero. It is bounded by the server's shortest response time: half of that is subtracted,
+    and a uniform distribution over all of it, for unequal delays in the two directions, is part of the deviation.
     ``limit_s``: deviation above which the clock is not known.
     """
 
@@ -79,7 +83,7 @@ class ServerClock:
         self.estimate = UNKNOWN
 
     def round_trip(self, duration_ns: int) -> None:
-        """Take a time in which the server answered, from asking to the answer [ns]."""
+        """Add a response time of the server, from the request to the answer [ns]."""
         self._round_trip_ns = min(self._round_trip_ns, max(duration_ns, 0))
 
     def see(self, sent_ns: int, received_ns: int) -> ClockEstimate:
@@ -101,19 +105,18 @@ class ServerClock:
         return self.estimate
 
     def stamp(self, sent_ns: int, received_ns: int) -> int | None:
-        """This computer's time [ns] of the server's stamp, never after ``received_ns``; None where the clock is not
-        known."""
+        """This computer's time [ns] of the server's stamp, never after ``received_ns``; None if it is unknown."""
         found = self.see(sent_ns, received_ns)
         return min(sent_ns + found.offset_ns, received_ns) if found.known else None
 
     def _watch(self, sent_ns: int, received_ns: int, delay_ns: int) -> None:
-        """Begin anew where the clock was set, and leave out what comes late."""
+        """Restart if the clock was set, and detect late pictures."""
         assert self._line is not None
         middle_ns, level, slope, spread = self._line
         off_ns = delay_ns - (level + slope * (sent_ns - middle_ns))
         if len(self._bins) < LEAST_BINS:
             return
-        if off_ns < -max(EARLY_NS, DEVIATIONS * spread):  # nothing comes before it is sent
+        if off_ns < -max(EARLY_NS, DEVIATIONS * spread):  # nothing arrives before it is sent
             self._begin(received_ns, held=False)
             return
         self._recent = [*self._recent[-(RECENT - 1) :], off_ns]
@@ -134,7 +137,7 @@ class ServerClock:
         self._held_until_ns = now_ns + HELD_NS if held else None
 
     def _fit(self) -> None:
-        """The line below all kept pictures that is nearest to them on average, and their rms distance above it."""
+        """Fit the line below all stored pictures with the least mean distance, and their rms distance above it."""
         if len(self._bins) < 2:
             self._line = None
             return
@@ -160,7 +163,7 @@ class ServerClock:
         bound_ns = self._round_trip_ns
         offset = level + slope * (sent_ns - middle_ns) - (0.5 * bound_ns if math.isfinite(bound_ns) else 0.0)
         span_ns = max(self._bins[-1][1] - self._bins[0][1], 1)
-        # A line on the fastest of n alike ones is off by their spread at most, more where it is carried beyond them.
+        # A line through the fastest of n similar ones is off by their spread at most, more if it is extrapolated.
         carried = 1.0 + 2.0 * abs(sent_ns - middle_ns) / span_ns
         deviation = math.hypot(bound_ns / math.sqrt(12.0), carried * spread)
         reason = ""
@@ -178,8 +181,9 @@ class ServerClock:
 
 
 def envelope(x: FloatArray, y: FloatArray) -> tuple[float, float]:
-    """Level at 0 and slope of the line below all points (n,), n >= 2, ``x`` ascending, that is nearest to them on
-    average: the edge of the lower convex hull over their mean."""
+    """Level at 0 and slope of the line below all points (n,), n >= 2, ``x`` ascending, with the least mean distance
+    from them: the edge of the lower convex hull at their mean.
+    """
     hull: list[int] = []
     for k in range(len(x)):
         while len(hull) >= 2 and _turns_down(x, y, hull[-2], hull[-1], k):
@@ -197,7 +201,7 @@ def _turns_down(x: FloatArray, y: FloatArray, a: int, b: int, c: int) -> bool:
 
 
 def seconds_in(text: str | None) -> int | None:
-    """Nanoseconds of a header such as ``1700000000.123456``; None where it is none, or of no century of ours."""
+    """Nanoseconds of a header such as ``1700000000.123456``; None if it is not a number, or out of range."""
     if text is None or len(text) > 40:
         return None
     whole, _, part = text.strip().partition(".")

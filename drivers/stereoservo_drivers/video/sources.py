@@ -37,14 +37,14 @@ from stereoservo.ports.devices import Clock
 from stereoservo_drivers.video.options import Place, VideoOptions
 
 OLDEST_NS = 1_000_000_000
-"""A picture that is said to have come longer ago has a stamp that is not believed."""
+"""Largest age [ns] of a picture's stamp that is believed."""
 Settings = dict[str, tuple[float | None, float | None]]
 
 
 @dataclass(frozen=True)
 class SourcePicture:
-    """An image of a source: ``image`` ``(height, width[, 3])``, when it was received, the source's number of it,
-    how many images received before it were skipped, and the time of its shutter, where the source knows it.
+    """An image of a source: ``image`` ``(height, width[, 3])``, the time of its reception, the source's number of it,
+    the number of images skipped before it, and the time of its shutter, if the source reports it.
     """
 
     image: ImageArray
@@ -60,9 +60,7 @@ class LiveSource(Protocol):
     settings: Settings
 
     def open(self) -> None:
-        """Connect. Blocks at most for the time-out of opening, as far as the libraries respect it. Raises
-        DriverError.
-        """
+        """Connect. Blocks at most for the time-out of opening, if the libraries respect it. Raises DriverError."""
         ...
 
     def read(self) -> SourcePicture | None:
@@ -70,7 +68,7 @@ class LiveSource(Protocol):
         ...
 
     def interrupt(self) -> None:
-        """Wake a blocked :meth:`open` or :meth:`read`, where that is possible. From another thread; never raises."""
+        """Wake a blocked :meth:`open` or :meth:`read`, if that is possible. From another thread; never raises."""
         ...
 
     def release(self) -> None:
@@ -91,7 +89,7 @@ class CaptureSource:
     def open(self) -> None:
         """Open and apply the settings. Raises DriverError."""
         device = self._place.kind == "device"
-        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # ours say more
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)  # ours are more specific
         if device:
             self._check_device()
         self._capture = self._open_device() if device else self._open_stream()
@@ -116,7 +114,7 @@ class CaptureSource:
             cv2.CAP_PROP_READ_TIMEOUT_MSEC,
             round(self._options.read_timeout_s * 1e3),
             cv2.CAP_PROP_N_THREADS,
-            1,  # of several, FFmpeg holds a picture back for each
+            1,  # with several threads, FFmpeg delays a picture for each
         ]
         return cv2.VideoCapture(self._place.url.geturl(), cv2.CAP_FFMPEG, times)
 
@@ -150,7 +148,7 @@ class CaptureSource:
             raise self._place.error("not_opened", f"takes no settings ({error.strerror})", retry=True) from error
 
     def _check_size(self, ioctl: Ioctl) -> None:
-        """Raises DriverError, with the device's modes, where it takes another size than asked."""
+        """Raise DriverError, with the device's modes, if its size differs from the requested one."""
         got = self.settings["width"][1], self.settings["height"][1]
         if None in got or got == (self._options.width, self._options.height):
             return
@@ -180,7 +178,7 @@ class CaptureSource:
                 "connection_lost", "gives no more pictures: unplugged, ended, or silent too long", retry=True
             )
         t_ns = self._clock.now_ns()
-        if self._place.kind == "device":  # OpenCV passes on the kernel's time, of UVC cameras by the monotonic clock
+        if self._place.kind == "device":  # OpenCV passes on the kernel's time, for UVC cameras by the monotonic clock
             t_ns = received_ns(t_ns, t_ns - capture.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
         whole, image = capture.retrieve()
         return SourcePicture(image, t_ns) if whole else None
@@ -195,15 +193,15 @@ class CaptureSource:
 
 
 def received_ns(now_ns: int, age_ns: float) -> int:
-    """When a picture came [ns, monotonic] that is said to be ``age_ns`` old at ``now_ns``; now, where that is not
-    believed: it is of another clock, or its age more than ``OLDEST_NS``.
+    """Reception time [ns, monotonic] of a picture with a reported age of ``age_ns`` at ``now_ns``; now, if that is not
+    credible: it belongs to another clock, or its age exceeds ``OLDEST_NS``.
     """
     return now_ns - round(age_ns) if 0.0 <= age_ns < OLDEST_NS else now_ns
 
 
 def apply_controls(ioctl: Ioctl, options: VideoOptions) -> Settings:
-    """Set the controls that ``options`` state, what they lock before what they set, and return what was asked and what
-    the device reads back, None where it has no such control. Raises ValueError for a value out of its range.
+    """Set the controls in ``options``, locking ones first, and return the requested values and those that the device
+    reads back, None if it has no such control. Raises ValueError for a value out of its range.
     """
     settings: Settings = {}
 
@@ -251,7 +249,7 @@ CONTROLS = {
     "gain": _BASE + 19,
     "power_line": _BASE + 24,
 }
-"""Ids of the kernel's controls, by our names."""
+"""Ids of the kernel's controls, by the names used here."""
 EXPOSURE_AUTO, EXPOSURE_MANUAL, EXPOSURE_APERTURE_PRIORITY = 0, 1, 3
 POWER_LINE = {0: 0, 50: 1, 60: 2}
 """Values of the control ``power_line``, by hertz; 0: no filter."""
@@ -259,7 +257,7 @@ DISABLED = 0x0001
 CAPTURE = 1
 DISCRETE = 1
 MOST_ENTRIES = 256
-"""Entries of a list that are read at most, should a driver never end it."""
+"""Largest number of entries read from a list, in case a driver never ends it."""
 
 
 class QueryControl(ctypes.Structure):
@@ -334,7 +332,7 @@ Ioctl = Callable[[int, ctypes.Structure], None]
 
 
 class ControlRange(NamedTuple):
-    """What a control takes: ``least`` to ``most`` in steps of ``step``."""
+    """Valid values of a control: ``least`` to ``most`` in steps of ``step``."""
 
     least: int
     most: int
@@ -342,7 +340,7 @@ class ControlRange(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """What a device delivers: pixel format (four letters), width and height [px], rates [Hz], highest first."""
+    """A mode of a device: pixel format (four letters), width and height [px], rates [Hz], highest first."""
 
     pixel_format: str
     width: int
@@ -356,7 +354,7 @@ class Mode(NamedTuple):
 
 @contextmanager
 def opened(path: str) -> Iterator[Ioctl]:
-    """Requests to the device at ``path``, beside whoever streams from it. Raises OSError."""
+    """Requests to the device at ``path``, concurrently with any process that streams from it. Raises OSError."""
     descriptor = os.open(path, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         yield lambda request, structure: _request(descriptor, request, structure)
@@ -369,7 +367,7 @@ def _request(descriptor: int, request: int, structure: ctypes.Structure) -> None
 
 
 def control_range(ioctl: Ioctl, name: str) -> ControlRange | None:
-    """Values that the control ``name`` takes; None: the device has none of it."""
+    """Valid values of the control ``name``; None: the device does not have it."""
     query = QueryControl(id=CONTROLS[name])
     try:
         ioctl(QUERY_CONTROL, query)
@@ -379,7 +377,7 @@ def control_range(ioctl: Ioctl, name: str) -> ControlRange | None:
 
 
 def set_control(ioctl: Ioctl, name: str, value: int) -> int | None:
-    """Set the control ``name`` and return what the device then says that it is; None: it has none, or refused.
+    """Set the control ``name`` and return the value that the device then reports; None: it has none, or refused.
 
     Raises ValueError, with the range, for a value outside of it.
     """
@@ -398,7 +396,7 @@ def set_control(ioctl: Ioctl, name: str, value: int) -> int | None:
 
 
 def modes(ioctl: Ioctl) -> list[Mode]:
-    """What the device says that it delivers, of sizes of its own choice; of others the largest."""
+    """Modes that the device reports, for sizes of its own choice; of others the largest."""
     found = []
     for index in range(MOST_ENTRIES):
         description = FormatDescription(index=index, type=CAPTURE)
@@ -437,7 +435,7 @@ def _rates(ioctl: Ioctl, code: int, width: int, height: int) -> tuple[float, ...
 
 
 def _entry(ioctl: Ioctl, request: int, structure: ctypes.Structure) -> bool:
-    """Whether the list has this entry. Raises OSError for anything but its end, or there being no such list."""
+    """Whether the list has this entry. Raises OSError for anything but its end, or a missing list."""
     try:
         ioctl(request, structure)
     except OSError as error:
@@ -454,13 +452,13 @@ def _entry(ioctl: Ioctl, request: int, structure: ctypes.Structure) -> bool:
 LIBRARY = "libaravis-0.8.so.0"
 BUFFERS = 8
 WAIT_US = 100_000
-"""A wait for a picture ends so often, to see whether it was interrupted."""
+"""Interval of checks whether a wait for a picture was interrupted."""
 FRAME_NUMBERS = 65535
-"""GigE Vision 1 counts pictures 1 to 65535 and begins again."""
+"""GigE Vision 1 counts pictures from 1 to 65535 and restarts."""
 AUTO_OFF, AUTO_CONTINUOUS = 0, 2
 DAMAGED_IN_A_ROW = 10
 SUCCESS = 0
-"""``ArvBufferStatus`` of a picture that is whole."""
+"""``ArvBufferStatus`` of a complete picture."""
 
 
 class GError(ctypes.Structure):
@@ -507,17 +505,17 @@ _FUNCTIONS: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "g_object_unref": (None, (c_void_p,)),
     "g_error_free": (None, (POINTER(GError),)),
 }
-"""Functions that are called: what they return and take."""
+"""Called functions: return types and arguments."""
 
 
 class AravisError(Exception):
-    """What the library says is wrong."""
+    """An error reported by the library."""
 
 
 def load_aravis(name: str = LIBRARY) -> Callable[..., Any]:
-    """A function that calls the library's functions by name. Raises OSError where it is not installed.
+    """A function that calls the library's functions by name. Raises OSError if it is not installed.
 
-    Where a function's last argument is a ``GError``, it is added, and raised as AravisError.
+    If a function's last argument is a ``GError``, it is added, and raised as AravisError.
     """
     library = ctypes.CDLL(name)
     for function, (returned, taken) in _FUNCTIONS.items():
@@ -602,7 +600,7 @@ class GenicamSource:
         self._ask("frame_rate", "frame_rate", "rate_hz", options.rate_hz)
 
     def _ask(self, available: str, feature: str, option: str, value: float) -> None:
-        """Set a feature and read it back. One that the camera has not is no error: the settings report it."""
+        """Set a feature and read it back. A missing one is not an error: the settings report it."""
         self.settings[option] = float(value), None
         if self._call(f"arv_camera_is_{available}_available", self._camera):
             self._call(f"arv_camera_set_{feature}", self._camera, value)
@@ -669,7 +667,7 @@ class GenicamSource:
     def release(self) -> None:
         """Stop the camera and release it."""
         if self._stream is not None:
-            with suppress(AravisError):  # one that is gone needs no stop
+            with suppress(AravisError):  # a lost camera needs no stop
                 self._call("arv_camera_stop_acquisition", self._camera)
             self._call("g_object_unref", self._stream)
             self._stream = None
@@ -679,14 +677,14 @@ class GenicamSource:
 
 
 class FrameNumbers:
-    """Numbers of pictures that go on where a camera's counter of 16 bits begins again."""
+    """Continuous picture numbers from a camera's counter of 16 bits."""
 
     def __init__(self) -> None:
         self._last = 0
         self._rounds = 0
 
     def whole(self, number: int) -> int:
-        """The number of a picture that the camera numbers ``number``."""
+        """The continuous number of a picture with the camera's ``number``."""
         if number < self._last and self._last - number > FRAME_NUMBERS // 2 and self._last <= FRAME_NUMBERS:
             self._rounds += 1
         self._last = number

@@ -8,10 +8,9 @@ from stereoservo.numerics.arrays import ImageArray
 
 
 class Watch:
-    """Numbers the frames of one camera, counts missing ones, withholds repeated images. Persists over
-    reconnections.
+    """Numbers the frames of one camera, counts missing ones, withholds repeated images. Persists over reconnections.
 
-    ``row``: how many pictures in a row have been equal to the last one delivered.
+    ``row``: number of consecutive pictures equal to the last one delivered.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -27,7 +26,7 @@ class Watch:
         self._late = 0
 
     def begin(self) -> None:
-        """The source was reopened: numbering and grid restart, the last image stays known."""
+        """Handle the reopening of the source: numbering and grid restart, the last image is kept."""
         self.row = 0
         self._last_seq = None
         self._last_ns = None
@@ -36,8 +35,9 @@ class Watch:
     def see(self, image: ImageArray, t_received_ns: int, seq: int | None, skipped: int, *, look: bool) -> bool:
         """Count an image and set its :attr:`number`; False: it must be withheld.
 
-        ``seq``: the source's number, None where it gives none: then what is missing is determined by the time since the
-        last. ``skipped``: pictures received before it that were not processed. ``look``: whether equal ones are frozen.
+        ``seq``: the source's number, None if it has none: missing frames are then determined by the time since the
+        last.
+        ``skipped``: pictures received before it that were not processed. ``look``: whether equal ones are frozen.
         """
         if seq is not None and seq == self._last_seq:
             self.frozen += 1
@@ -61,7 +61,7 @@ class Watch:
     def _missing(self, t_received_ns: int, seq: int | None, skipped: int) -> int:
         """Number of frames missing just before this one; -1: one that was counted as missing was only late."""
         if seq is not None and self._last_seq is not None:
-            return max(0, seq - self._last_seq - 1 - skipped)  # a lower one: the source began again
+            return max(0, seq - self._last_seq - 1 - skipped)  # a lower number: the source has restarted
         if seq is not None or self._last_ns is None:
             return 0
         missing = round((t_received_ns - self._last_ns) * 1e-9 * self._rate_hz) - 1 - skipped

@@ -1,4 +1,4 @@
-"""Command ``stereoservo auxiliary``: orders a gripper or other joints beside the arm's, and digital outputs."""
+"""Command ``stereoservo auxiliary``: moves a gripper or other joints beside the arm's, and switches digital outputs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from stereoservo.messages.wire import StateMessage
 
 SWITCHED = {"on": "1", "off": "0"}
 SHARE = 0.01
-"""Of a joint's range: so near it has arrived, and so little it has not moved."""
+"""Share of a joint's range: within it of its target a joint has arrived, and within it of its last position it rests.
+"""
 STANDS_S = 0.5
 POLL_S = 0.05
 
@@ -42,7 +43,7 @@ def auxiliary(
 
 
 def _arrived(client: Client, ordered: dict[str, float], near: dict[str, float], wait_s: float) -> StateMessage:
-    """The state once all are where they were ordered, or have stood for a while, or ``wait_s`` have passed."""
+    """The state once all joints are at their targets, have rested for a while, or ``wait_s`` have passed."""
     until = time.monotonic() + wait_s
     state = stood = client.status()
     moved_at = time.monotonic()
@@ -51,7 +52,7 @@ def _arrived(client: Client, ordered: dict[str, float], near: dict[str, float], 
             break
         time.sleep(POLL_S)
         state = client.status()
-        if not _near(state.auxiliary, stood.auxiliary, near):  # however slowly
+        if not _near(state.auxiliary, stood.auxiliary, near):  # moved, however slowly
             stood, moved_at = state, time.monotonic()
     return state
 

@@ -55,19 +55,19 @@ COMMANDS: dict[str, str] = {
 """Commands of the service: name -> module:function below ``stereoservo.cli``."""
 
 ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True}
-"""Settings of a command that takes whatever it is given."""
+"""Settings of a command that accepts any arguments."""
 
 _USAGE_ERROR: type[Exception] = typer.BadParameter.__mro__[1]
-"""click's UsageError, wherever this version of typer keeps its click."""
+"""click's UsageError, independent of where this version of typer has its click."""
 
 
 class LazyGroup(TyperGroup):
-    """The group of commands, each imported when it is called; a broken plug-in is listed with its error and does
-    not affect the others.
+    """The group of commands, each imported when it is called; a broken plug-in is listed with its error and does not
+    affect the others.
     """
 
     names_only = False
-    """While the shell completes names: no command is imported for its text."""
+    """True while the shell completes names: no command is then imported for its text."""
 
     def list_commands(self, ctx: Any) -> list[str]:
         extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
@@ -91,7 +91,7 @@ class LazyGroup(TyperGroup):
         return _command(cmd_name, function)
 
     def shell_complete(self, ctx: Any, incomplete: str) -> Any:
-        """Commands and options of the program that begin so."""
+        """Commands and options of the program that start with ``incomplete``."""
         self.names_only = True
         try:
             return super().shell_complete(ctx, incomplete)
@@ -99,7 +99,7 @@ class LazyGroup(TyperGroup):
             self.names_only = False
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """The groups of ``--help``: no command is imported for it whose text can be read from its source."""
+        """Write the groups of ``--help``; a command is imported only if its text cannot be read from its source."""
         places = _places()
         for heading, names in grouped(self.list_commands(ctx)):
             commands = [(name, _described(name, places[name]) or self.get_command(ctx, name)) for name in names]
@@ -111,17 +111,17 @@ class LazyGroup(TyperGroup):
 
 
 WHOLE = 1000
-"""Characters of a command's first sentence that are shown: all."""
+"""Maximum length of a command's first sentence in the list: effectively unlimited."""
 
 
 def _places() -> dict[str, str]:
-    """Where each command is: ``module:function``."""
+    """Location of each command: ``module:function``."""
     extra = {plugin.name: plugin.value for plugin in plugins.list_plugins(plugins.COMMANDS)}
     return extra | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
 
 
 def _described(name: str, where: str) -> Any:
-    """A command that has only its help text, read from the source of ``module:function`` without an import; None where
+    """A command that has only its help text, read from the source of ``module:function`` without an import; None if
     that cannot be read.
     """
     module, _, function = where.partition(":")
@@ -129,7 +129,7 @@ def _described(name: str, where: str) -> Any:
         spec = importlib.util.find_spec(module)
         source = "" if spec is None or spec.origin is None else Path(spec.origin).read_text(encoding="utf-8")
         tree = ast.parse(source)
-    except Exception:  # whatever a third party's package raises on import, or holds in place of source
+    except Exception:  # whatever a third party's package raises on import, or contains in place of source
         return None
     found = [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name == function]
     if not found:
@@ -150,7 +150,7 @@ def _load(name: str) -> Any:
 
 
 def _broken(code: str, message: str) -> Any:
-    """A command that says why it cannot run."""
+    """A command that reports why it cannot run."""
 
     def broken(ctx: typer.Context, json: bool = typer.Option(False, "--json")) -> None:
         raise CommandError(code, message, arguments=ctx.args)
@@ -190,7 +190,7 @@ def root(
 def run(arguments: list[str], raised: RaisedStop | None) -> int:
     """Run one command line; returns the exit code. Failures are printed, as JSON with ``--json``.
 
-    ``raised``: the stop that was raised for it already, see `early_stop`.
+    ``raised``: the stop that was already raised for it, see `early_stop`.
     """
     as_json = "--json" in arguments
     try:
@@ -202,7 +202,7 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
         fail(CommandError("interrupted", "interrupted"), as_json)
         return EXIT_INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()  # whoever read us has gone
+        sys.stderr.close()  # the reader of the output has ended
         return EXIT_FAILED
     except _USAGE_ERROR as error:
         context = getattr(error, "ctx", None)
@@ -225,7 +225,7 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
 
 
 # -- groups of verbs -----------------------------------------------------------------------------------------
-# What ``--help`` tells of the commands beside their own texts: the group and an example of each.
+# Additional texts of ``--help``: the group of each command and an example.
 
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -244,7 +244,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "Look": ("watch", "web", "record", "replay", "export", "examine"),
     "Simulate and measure": ("demo", "emulate", "simulate", "reproduce", "bench"),
 }
-"""Headings and their commands, in the order in which they are needed; any other command stands below ``OTHERS``."""
+"""Headings and their commands, in the order in which they are needed; any other command is listed below ``OTHERS``."""
 OTHERS = "Others"
 EXAMPLES: dict[str, str] = {
     "setup": "setup mycell.toml",
@@ -289,7 +289,7 @@ EXAMPLES: dict[str, str] = {
 
 
 def grouped(names: list[str]) -> list[tuple[str, list[str]]]:
-    """Headings with those of the commands that are there; what is in no group comes last."""
+    """Headings with the available commands of each; commands without a group come last."""
     known = {name for members in GROUPS.values() for name in members}
     groups = [(heading, [name for name in members if name in names]) for heading, members in GROUPS.items()]
     groups.append((OTHERS, [name for name in names if name not in known]))

@@ -1,4 +1,4 @@
-"""The stop slot raised for ``stereoservo stop CELL``, read off the command line before anything but it is imported."""
+"""The stop slot raised for ``stereoservo stop CELL``, from the command line alone, before any other import."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class RaisedStop(NamedTuple):
 
 
 def raise_stop(arguments: Sequence[str]) -> RaisedStop | None:
-    """Raise the stop slot where the command line is ``stop CELL`` for a cell of this host; None for any other, and
-    where there is no slot.
+    """Raise the stop slot if the command line is ``stop CELL`` for a cell of this host; None otherwise, and if there is
+    no slot.
 
-    A mistyped option beside the cell does not hold up the stop: the command complains about it afterwards.
+    A mistyped option after the cell does not delay the stop: the command reports it afterwards.
     """
     if arguments[:1] != ["stop"] or any(word.startswith(("--help", "--endpoint")) for word in arguments):
         return None
@@ -31,6 +31,6 @@ def raise_stop(arguments: Sequence[str]) -> RaisedStop | None:
     try:
         directories = directories_of(cells[0])
         slot = StopSlot(directories.stop_slot)
-    except (DirectoryError, SlotError, OSError):  # the command says what is wrong with it
+    except (DirectoryError, SlotError, OSError):  # the command reports the error
         return None
     return RaisedStop(directories, slot, slot.raise_stop())

@@ -112,7 +112,7 @@ def _text(report: RecordingReport) -> str:
 
 
 def _of_episode(report: RecordingReport, name: str, rms: float) -> str:
-    """Line on an episode: its residuals, and which causes are in it."""
+    """Line on an episode: its residuals, and the causes found in it."""
     held = [f"{one.kind} {one.subject}".strip() for one in report.causes if int(name) in one.episodes]
     return f"  episode {name}: {rms:.3f} px rms, {', '.join(held) or 'nothing has happened'}"
 
@@ -126,11 +126,11 @@ BODY_MOVES = (
     "may be told as a cause, and is no fault; stamps are not examined, since such motion looks as if they were late"
 )
 MOST_FRAMES = 6000
-"""Frames that are examined; of longer recordings every second one, every third, …"""
+"""Maximum number of frames that are examined; of longer recordings every second one, every third, …"""
 
 
 def read_flight(path: Path) -> RecordedViews:
-    """The recording in a flight (*.mcap): what the core took in of joints and cameras. Raises RecordingError."""
+    """The recording in a flight (*.mcap): joints and cameras as the core received them. Raises RecordingError."""
     motion = read_motion(path)
     observations, model = _contents(path)
     settings = motion.settings
@@ -156,7 +156,7 @@ def read_flight(path: Path) -> RecordedViews:
     begin = int(motion.joint_ns[0])
     known_offsets = {} if model is None else {one.camera: one.offset_s for one in model.shutter_offsets}
     stamps = [(one.t_shutter_ns - begin) * 1e-9 + known_offsets.get(one.camera, 0.0) for one in kept]
-    # Numbers count what the camera took; where frames are left out they would tell of drops.
+    # Sequence numbers count the camera's frames; if frames are left out, they would look like dropped ones.
     numbers = [one.seq if every == 1 else -1 for one in kept]
     return RecordedViews(
         settings.joint_names, settings.joint_kinds,
@@ -190,15 +190,15 @@ def _contents(path: Path) -> tuple[list[CameraObservation], CellModel | None]:
 
 
 # -- LeRobot data sets ---------------------------------------------------------------------------------------
-# A LeRobot data set as a recording: docs/recordings.md has what is read of it.
+# A LeRobot data set as a recording: docs/recordings.md lists the data that are read.
 
 
 BETWEEN_S, HELD_S = 1.0, 0.4
-"""Time put between two episodes, and for which the joints then go on as at their ends."""
+"""Time between two episodes, and time for which the joints are extrapolated beyond both ends [s]."""
 COMPRESSED_PX = 0.1
-"""Deviation of pixels in compressed pictures at least, whatever detectors state for others."""
+"""Least standard deviation of pixels in compressed pictures, whatever detectors state for others."""
 COUNTED_S = 1e-3
-"""Difference of stamps from the count of frames at which they are that count."""
+"""Largest difference of stamps from a count of frames at which they are taken as that count."""
 
 
 def read_data_set(
@@ -266,8 +266,8 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
 
 
 def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Stamps (r,) [s] of one clock, episodes one after another, and times (j,) and states (j, n) of the joints, which
-    go on for a moment before and after each episode: pictures that are late against them are of there.
+    """Stamps (r,) [s] on one clock, episodes one after another, and times (j,) and states (j, n) of the joints. The
+    joints are extrapolated before and after each episode, for pictures that are late relative to them.
     """
     stamps = rows.stamp.copy()
     times, states, end = [], [], 0.0
@@ -282,7 +282,7 @@ def _one_clock(rows: lerobot.EpisodeRows) -> tuple[FloatArray, FloatArray, Float
 
 
 def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
-    """State (1, n) a moment after the last one of two at their ``times``, or before where they go backwards."""
+    """State (1, n) shortly after the last one of two at their ``times``, or before it if they are in reverse order."""
     elapsed = abs(float(times[-1] - times[0]))
     return states[-1:] + (states[-1:] - states[:1]) * (HELD_S / elapsed if elapsed > 0.0 else 0.0)
 
@@ -303,11 +303,11 @@ DETECTOR = "detector.toml"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
 STATED_PX = 0.1
-"""Deviation that is stated of a pixel without one; what the pixels scatter is estimated."""
+"""Standard deviation assumed for a pixel without a stated one; the actual scatter of the pixels is estimated."""
 LARGEST = 10**9
-"""Of whole numbers: markers, sizes, counts of frames."""
+"""Largest value of integers: markers, sizes, counts of frames."""
 UNIT = 1e-2
-"""How far from 1 the length of a quaternion may be."""
+"""Largest deviation of a quaternion's norm from 1."""
 
 Rows = list[dict[str, str]]
 
@@ -337,8 +337,8 @@ def read_folder(folder: Path) -> RecordedViews:
 
 
 class GatheredFrames:
-    """Frames gathered: by (camera, stamp) its number, episode, and pixels with their deviations by marker; ``sizes``
-    (width, height) of the cameras' pictures.
+    """Collected frames: by (camera, stamp) the number, episode, and pixels with their standard deviations by marker;
+    ``sizes`` (width, height) of the cameras' pictures.
     """
 
     def __init__(self, sizes: dict[str, tuple[int, int]]) -> None:
@@ -359,7 +359,7 @@ def gathered_views(
     frames: GatheredFrames, stamps: FloatArray, names: tuple[str, ...], kinds: tuple[Kind, ...], positions: FloatArray,
     generators: FloatArray | None, timed: bool, counted: bool = False,
 ) -> RecordedViews:  # fmt: skip
-    """The recording of joints ``positions`` (j, n) at ``stamps`` (j,) in their order, and of the frames within."""
+    """The recording of joints ``positions`` (j, n) at ``stamps`` (j,) in their order, and the frames between them."""
     cameras = list(frames.sizes)
     keys = sorted(frames.seen, key=lambda one: (one[1], cameras.index(one[0])))
     inside = [k for k in keys if stamps[0] <= k[1] <= stamps[-1] and (timed or k[1] in stamps)]
@@ -418,7 +418,7 @@ def _poses(
     poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
     poses[:, :3, 3] = values[:, :3]
     positions, generators, _ = free_arm(poses[order])
-    # A turn goes on beyond half a turn.
+    # Unwrap turns beyond half a turn.
     return NAMES, KINDS, np.hstack([positions[:, :3], np.unwrap(positions[:, 3:], axis=0)]), generators
 
 
@@ -436,7 +436,7 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     for line, row in enumerate(rows, 2):
         seen = frames.of(path, line, row, key)
         if not row["marker"]:
-            continue  # a frame in which nothing was seen
+            continue  # a frame without detections
         sigma = _number(path, line, row, "sigma") if row.get("sigma") else STATED_PX
         if not sigma > 0.0:
             raise _wrong(path, line, "sigma", row["sigma"], "a positive number [px]")
@@ -473,7 +473,7 @@ def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
 def detected(
     detector: Detector, camera: str, number: int, image: np.ndarray[Any, Any]
 ) -> dict[int, tuple[float, float, float]]:
-    """Pixels and their deviation [px] of each marker that a detector finds in a picture (h, w)."""
+    """Pixels and their standard deviations [px] of each marker that a detector finds in a picture (h, w)."""
     shown = detector.detect(Frame(camera, number, 0, 0, image), None)
     spread = np.sqrt(0.5 * np.trace(shown.covariances, axis1=1, axis2=2))
     return {
@@ -483,7 +483,7 @@ def detected(
 
 
 def stated_detector(path: Path, camera: str) -> Detector:
-    """The detector of a camera that a file names. Raises CommandError."""
+    """The detector of a camera, named in a file. Raises CommandError."""
     try:
         stated = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

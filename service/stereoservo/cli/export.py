@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 
 SAME = 1e-9
-"""Relative error up to which a replay on another processor tells the same."""
+"""Relative error up to which a replay on another processor counts as the same."""
 
 
 def export(
@@ -127,7 +127,7 @@ def export(
 
 
 def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: Path | None, json: bool) -> None:
-    from stereoservo.calibration.camera_rig import exchange  # OpenCV and YAML: for this alone
+    from stereoservo.calibration.camera_rig import exchange  # OpenCV and YAML: only for this
     from stereoservo.calibration.camera_rig.rig_calibration import load_rig
 
     cameras, unit = exchange.load_cameras(file) if file.suffix != ".json" else (), "m"
@@ -198,7 +198,7 @@ def _export_model(file: Path, urdf: Path | None, dh: bool, length: str, cell_pat
             rows = denavit_hartenberg(model, known)
             told["denavit_hartenberg"] = msgspec.to_builtins(rows)
             lines += [" | ".join(cells) for cells in (DH_HEAD, *(dh_cells(row) for row in rows))]
-            from stereoservo.kinematics.inverse.recognition import structure  # statistics: for this alone
+            from stereoservo.kinematics.inverse.recognition import structure  # statistics: only for this
 
             holds = structure(model)
             told["structure"] = [{**asdict(one), "joints": [model.joint_names[j] for j in one.joints]} for one in holds]
@@ -218,7 +218,7 @@ def _export_model(file: Path, urdf: Path | None, dh: bool, length: str, cell_pat
 
 
 def _words(one: Evidence, model: CellModel) -> str:
-    """What holds of some axes within the model's covariance, in words."""
+    """Constraints on some axes that hold within the model's covariance, in words."""
     *first, last = (model.joint_names[j] for j in one.joints)
     how = "are parallel" if one.condition == "parallel" else "meet in one point"
     held = (
@@ -230,7 +230,7 @@ def _words(one: Evidence, model: CellModel) -> str:
 
 
 def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLength:
-    """The known length that ``text`` or else the cell file states; by default the unit of the first slide. Raises
+    """The known length, from ``text`` or else the cell file; by default the unit of the first prismatic joint. Raises
     CommandError.
     """
     if not text and cell is not None and cell.calibration is not None:
@@ -251,15 +251,15 @@ def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLe
 
 
 # -- flights -------------------------------------------------------------------------------------------------
-# A flight recording with what other programs can read beside it: copies its bit-exact messages into a new file, runs
-# them through the core, and adds what the cell did with Foxglove's schemas (`foxglove_channels`).
+# A flight recording with further messages for other programs: copies its bit-exact messages into a new file, runs them
+# through the core, and adds the cell's state with Foxglove's schemas (`foxglove_channels`).
 
 
 STATE_EVERY_NS = 50_000_000
 SCENE_EVERY_NS = 200_000_000
 JPEG_QUALITY = 80
 BLOCK_STEPS = 100
-"""Steps in a compressed block: 0.4 s of a loop of 250 Hz."""
+"""Steps per compressed block: 0.4 s of a loop of 250 Hz."""
 
 
 @dataclass
@@ -280,7 +280,7 @@ class FlightChannels:
     _scene_ns: int = -SCENE_EVERY_NS
 
     def take(self, inputs: StepInputs, outputs: StepOutputs) -> Iterator[Published]:
-        """Messages of one step: events and frames as they are, state and scene less often."""
+        """Messages of one step: all events and frames, state and scene less often."""
         status = outputs.status
         if inputs.model_update is not None:
             self.models[inputs.model_update.model.epoch] = inputs.model_update.model
@@ -332,7 +332,7 @@ class FlightChannels:
 
 
 class _File:
-    """The exported file: one channel a topic, made with its first message."""
+    """The exported file: one channel per topic, created with its first message."""
 
     def __init__(self, stream: Any) -> None:
         self._writer = Writer(stream, compression=CompressionType.LZ4, enable_data_crcs=True)
@@ -342,13 +342,13 @@ class _File:
         self.counts: dict[str, int] = {}
 
     def copy(self, topic: str, data: bytes, t_ns: int) -> None:
-        """A message of the recording, as it is."""
+        """Write a message of the recording, unchanged."""
         if topic not in self._channels:
             self._channels[topic] = self._writer.register_channel(topic, TOPICS[topic], 0)
         self._add(topic, data, t_ns)
 
     def publish(self, message: Published) -> None:
-        """A message with a schema."""
+        """Write a message with a schema."""
         if message.topic not in self._channels:
             schema = schema_of(message.content)
             if schema.name not in self._schemas:
@@ -426,7 +426,7 @@ def _fill(file: _File, source: Path, target: Path) -> ExportResult:
 
 
 def _copy(file: _File, source: Path, t_ns: int, shift_ns: int) -> None:
-    """The recording's own messages, in their compressed form, at the wall clock's time of the step they belong to."""
+    """The recording's own messages, in their compressed form, at the wall clock's time of their step."""
     blocks, checkpoints, held, held_ns = StepBlocks(), Checkpoints(), list[bytes](), t_ns
     for topic, data in whole_messages(source):
         if topic == "step":

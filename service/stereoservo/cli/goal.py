@@ -51,7 +51,7 @@ def read_images(cell: str, endpoint: str | None, images: Path, at_s: float, fram
 
     Raises CommandError, SetPointError, ImageFileError, DriverError, PluginError, CellFileError, NotRunningError.
     """
-    from stereoservo.daemon.jobs.recorded_set_points import set_points_from_images  # OpenCV: for this alone
+    from stereoservo.daemon.jobs.recorded_set_points import set_points_from_images  # OpenCV: only for this
 
     if cell.endswith(".toml"):
         path = Path(cell)
@@ -79,7 +79,7 @@ def feature_tree(found: tuple[SetPoints, ...]) -> dict[str, Any]:
 
 
 def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
-    """Raise CommandError where a recording does not match a camera of the live cell in its present setup."""
+    """Raise CommandError if a recording does not match a camera of the live cell in its current setup."""
     if not found:
         return
     cameras = {camera.name: (camera.width, camera.height) for camera in client.info().cameras}
@@ -96,10 +96,10 @@ def require_cameras(client: Client, found: tuple[SetPoints, ...]) -> None:
 
 Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
-"""The process that waits for a goal holds its lease: when it dies, the arm stops."""
+"""The process that waits for a goal renews its lease: when it dies, the arm stops."""
 
 FOR_POSTURES = ("taught", "features")
-"""Kinds of targets whose postures are told."""
+"""Kinds of targets whose postures are listed."""
 
 NameArgument = Annotated[
     str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.", autocompletion=goals_beginning)
@@ -315,10 +315,10 @@ def _require_images(images: Path | None, at: float, frames: int) -> None:
 
 
 def _ends_in(cell: str, target: dict[str, Any], number: int, operator: str | None) -> dict[str, float]:
-    """Joints by name of the posture ``number`` that reaches a target as on the wire. Raises CommandError."""
+    """Joints by name of the posture ``number`` that reaches a target in wire format. Raises CommandError."""
     if target.get("kind") not in FOR_POSTURES:
         raise CommandError("usage", "--posture goes with NAME or --set-points, on the cell's host")
-    from stereoservo.cli.ik import posture  # numerics: for this alone
+    from stereoservo.cli.ik import posture  # numerics: only for this
 
     return posture(cell, target, number, operator)
 
@@ -339,7 +339,7 @@ def _checked(client: Client, requested: Goal, as_json: bool) -> None:
 
 
 def _followed(source: str) -> tuple[dict[str, Any], Stream]:
-    """First target of a stream, as on the wire, and the stream. Raises CommandError for an empty one."""
+    """First target of a stream, in wire format, and the stream. Raises CommandError for an empty one."""
     stream = stream_lines(source)
     first = next(stream, None)
     if first is None:
@@ -369,13 +369,13 @@ def _run(
         else:
             emit({"id": handle.id, "accepted": True}, handle.id, as_json)
     except KeyboardInterrupt:
-        with suppress(ClientError):  # not accepted yet, or ended already
+        with suppress(ClientError):  # not accepted yet, or already ended
             client.cancel(requested.id)
         raise
 
 
 def follow(handle: GoalHandle, as_json: bool, cell: str) -> None:
-    """Wait for a goal's end and print it; a hold meanwhile too. Raises CommandError unless it was reached."""
+    """Wait for a goal's end and print it; holds are printed, too. Raises CommandError unless it was reached."""
     result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, cell))
     if result.outcome != "reached":
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))

@@ -1,4 +1,4 @@
-"""Command ``stereoservo home``: moves every joint to the cell's home position; by the pictures, where the joints' zeros
+"""Command ``stereoservo home``: moves every joint to the cell's home position; by the pictures, if the joints' zeros
 are unknown or wrong (thesis 4.5.4, 4.5.5).
 """
 
@@ -31,20 +31,23 @@ if TYPE_CHECKING:
     from stereoservo.numerics.arrays import FloatArray
 
 SPEED = 0.5
-"""Share of the joints' velocities, as without pictures."""
+"""Share of the joints' velocity limits, as without pictures."""
 FRAMES, LOOK_S, SETTLE_S = 15, 5.0, 0.4
-"""Frames of each camera that a look averages, the longest that it takes, and how long the arm rests before it."""
+"""Number of frames averaged per camera, time limit of an observation [s], and time of rest before it [s]."""
 LOOKS = 6
 PROBE = 0.15
-"""Longest way of a joint [rad or m] before the looks agree on one answer."""
+"""Longest motion of a joint [rad or m] before the observations agree on one answer."""
 TELLS_PX = 2.0
-"""Least difference of the pictures of two postures that a motion is made for, beside the model's own."""
+"""Least difference [px] between the pictures of two postures for a motion to be made, in addition to the model's own.
+"""
 AGREES = 5.0
-"""Deviations within which zeros count as right."""
+"""Number of standard deviations within which zeros count as right."""
 
 
 class Look(NamedTuple):
-    """Readings of the joints (n,), raw pixels (c, m, 2) of the markers, NaN where unseen, deviations (c, m) [px]."""
+    """One observation: joint readings (n,), raw pixels (c, m, 2) of the markers, NaN if unseen, standard deviations (c,
+    m) [px].
+    """
 
     readings: FloatArray
     pixels: FloatArray
@@ -121,7 +124,7 @@ def _home_of(arm: LearntArm) -> FloatArray:
 
 
 def _look(client: Client, arm: LearntArm) -> Look:
-    """The markers' mean pixels, from an arm at rest. Raises CommandError where the body is not seen."""
+    """The markers' mean pixels, with the arm at rest. Raises CommandError if the body is not seen."""
     import numpy as np
 
     model = arm.model
@@ -165,8 +168,8 @@ def _look(client: Client, arm: LearntArm) -> Look:
 
 
 def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
-    """What to add to the readings, by all looks. Raises CommandError where the pictures do not tell, or tell of a
-    posture that the cell's limits forbid.
+    """Corrections of the joint readings, from all observations. Raises CommandError if the pictures do not determine
+    them, or if the resulting posture is beyond the cell's limits.
     """
     import numpy as np
 
@@ -193,7 +196,7 @@ def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
 
 
 def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> list[str]:
-    """Joints that stand beyond the cell's limits by the pictures, in words; whole turns are not seen."""
+    """Joints that are beyond the cell's limits according to the pictures, as text; whole turns cannot be observed."""
     import numpy as np
 
     at = readings + found.offset
@@ -209,7 +212,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
 
 
 def _telling(arm: LearntArm, look: Look, found: JointZeros) -> TellingMotion | None:
-    """Motion that tells the postures of a look from each other; None where one is left, or no motion tells."""
+    """Motion that distinguishes the possible postures of an observation; None if one remains, or no motion does."""
     import numpy as np
 
     from stereoservo.kinematics.joint_angles import telling_motion
@@ -226,14 +229,14 @@ def _right(found: JointZeros) -> bool:
 
 
 def _tolerance_px(arm: LearntArm) -> float:
-    """Distance from the home pictures that is there: the cell's tolerance, or what model and images differ by."""
+    """Tolerance [px] of the distance from the home pictures: the cell's tolerance, or the error of the model."""
     statistics = arm.model.statistics
     own = OWN_SIGMA_PX if statistics is None else max(OWN_SIGMA_PX, statistics.rms_px)
     return max(arm.cell.servo.tolerance_px, 3.0 * own)
 
 
 def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
-    """Largest distance [px] of a marker from where the model has it in the home posture's pictures."""
+    """Largest distance [px] of a marker from its position predicted by the model for the home posture."""
     import numpy as np
 
     from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
@@ -321,7 +324,7 @@ def _undecided(
     telling: TellingMotion | None,
     right: bool,
 ) -> list[str]:
-    """Lines of a look that several postures explain."""
+    """Lines on an observation that several postures explain."""
     lines = [
         f"{row['joint']:>8}  reads {row['reads']:+.4f}, is at "
         + " or ".join(f"{posture[j]:+.4f}" for posture in postures)

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from stereoservo.numerics.arrays import FloatArray
 
 OWN_SIGMA_PX = 0.1
-"""What images and model differ by beside the noise that is stated, where the fit does not say."""
+"""Difference of images and model in addition to the stated noise [px], if the fit does not report it."""
 
 
 @dataclass(frozen=True, eq=False)
 class LearntArm:
-    """A cell on this host: its file, its model and the joints ``now`` by name, None where no daemon runs it."""
+    """A cell on this host: its file, its model and the current joints ``now`` by name, None if no daemon runs it."""
 
     cell: CellFile
     model: CellModel
@@ -36,7 +36,7 @@ class LearntArm:
 
     @property
     def limits(self) -> FloatArray:
-        """(n, 2) [rad or m], without end where the cell file has none."""
+        """Joint limits (n, 2) [rad or m], infinite if the cell file has none."""
         import numpy as np
 
         stated = {limit.joint: (limit.min, limit.max) for limit in self.cell.safety.limit}
@@ -93,7 +93,7 @@ def posture(cell: str, target: dict[str, Any], number: int, operator: str | None
 
 
 def learnt_arm(cell: str, operator: str | None) -> LearntArm:
-    """Cell file, model and present joints of a cell on this host.
+    """Cell file, model and current joints of a cell on this host.
 
     Raises CommandError, NotRunningError, CellFileError, ClientError.
     """
@@ -120,7 +120,7 @@ def learnt_arm(cell: str, operator: str | None) -> LearntArm:
 
 
 def postures_of(arm: LearntArm, target: dict[str, Any]) -> Postures:
-    """All postures that reach a ``target`` as on the wire; numbers stay as they are when the arm moves."""
+    """All postures that reach a ``target`` in wire format; their numbers do not change when the arm moves."""
     import numpy as np
 
     from stereoservo.kinematics.inverse.postures import postures
@@ -131,7 +131,7 @@ def postures_of(arm: LearntArm, target: dict[str, Any]) -> Postures:
 
 
 def _images(arm: LearntArm, target: dict[str, Any]) -> tuple[FloatArray, FloatArray]:
-    """Pixels (c, m, 2) of the model's markers and their deviations (c, m) [px]."""
+    """Pixels (c, m, 2) of the model's markers and their standard deviations (c, m) [px]."""
     import numpy as np
 
     from stereoservo.daemon.taught_goals import load_taught
@@ -184,7 +184,7 @@ def _row(arm: LearntArm, found: Postures, number: int) -> dict[str, Any]:
 
 
 def _way(client: Client, target: dict[str, Any], joints: dict[str, float]) -> dict[str, Any]:
-    """What a live cell answers to a plan that ends in the posture, without motion."""
+    """Reply of a live cell to a plan that ends in the posture, without motion."""
     goal = make_goal(target, posture=joints)
     try:
         plan = client.check(goal).plan
@@ -196,7 +196,7 @@ def _way(client: Client, target: dict[str, Any], joints: dict[str, float]) -> di
 
 
 def _text(arm: LearntArm, found: Postures, rows: list[dict[str, Any]]) -> str:
-    """The table for people."""
+    """The table as text."""
     answer = found.found
     how = f"{answer.case.replace('_', ' ')}, {'searched' if answer.case == 'numerical' else 'in closed form'}"
     lines = [f"{len(rows)} postures on model {arm.model.epoch} ({how}); {len(answer.beyond_limits)} beyond the limits"]
@@ -234,7 +234,7 @@ def _way_text(row: dict[str, Any]) -> str:
 
 
 def _why_none(arm: LearntArm, found: Postures) -> str:
-    """Why no posture reaches the goal, and what would."""
+    """Text on why no posture reaches the goal, and what would help."""
     answer, names = found.found, arm.model.joint_names
     if answer.outcome == "beyond_limits":
         q, limits = answer.beyond_limits[0], arm.limits

@@ -110,7 +110,7 @@ def _copy(source: str, file: Path, cell: str, contradicted: object) -> None:
 
 
 def toml_options(given: list[str]) -> str:
-    """Lines of ``[joints.options]``; a value that is no TOML is a string. Raises CommandError."""
+    """Lines of ``[joints.options]``; a value that is not TOML is a string. Raises CommandError."""
     lines = []
     for text in given:
         key, found, value = text.partition("=")

@@ -25,7 +25,7 @@ def install() -> None:
 
 
 def check() -> None:
-    """Raise KeyboardInterrupt where an interrupt is pending. For loops that wait while the arm moves."""
+    """Raise KeyboardInterrupt if an interrupt is pending. For loops that wait while the arm moves."""
     if _asked:
         raise KeyboardInterrupt
 
@@ -37,7 +37,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 class Ending:
-    """Whether a server was asked to end. ``wake``: called in the main thread when it is."""
+    """Whether a server was requested to end. ``wake``: called in the main thread when it is."""
 
     def __init__(self) -> None:
         self.asked = False
@@ -46,11 +46,12 @@ class Ending:
 
 @contextmanager
 def ending(seconds: float) -> Iterator[Ending]:
-    """Within, SIGINT and SIGTERM ask for the end and raise nothing: an exception from anywhere tears an event loop,
-    which may lose the step of a task that is then waited for, and is itself lost in a destructor.
+    """Context manager in which SIGINT and SIGTERM request the end and raise nothing. An exception at an arbitrary place
+    breaks an event loop: a task may lose a step that is then waited for, and in a destructor the exception itself is
+    lost.
 
-    A process that has not ended ``seconds`` after it was asked is ended, and what each of its threads did is printed. A
-    second signal ends it at once.
+    A process that has not ended ``seconds`` after the request is ended by force, and the stacks of its threads are
+    printed. A second signal ends it at once.
     """
     found = Ending()
 
@@ -71,8 +72,8 @@ def ending(seconds: float) -> Iterator[Ending]:
 
 
 def threads_left(seconds: float) -> list[str]:
-    """Names of the other threads that have not ended within ``seconds``: an exit waits for some of them, and others are
-    torn out of their libraries by it.
+    """Names of the other threads that have not ended within ``seconds``: an exit waits for some of them, and interrupts
+    others inside their libraries.
     """
     until = time.monotonic() + seconds
     others = [thread for thread in threading.enumerate() if thread is not threading.current_thread()]

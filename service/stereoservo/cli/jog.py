@@ -35,7 +35,7 @@ def jog(
                 time.sleep(min(EVERY_S, left))
                 client.jog(requested, LEASE_S)
         finally:
-            with suppress(ClientError):  # the lease ends it anyhow, a little later
+            with suppress(ClientError):  # the lease ends it anyway, slightly later
                 client.jog(dict.fromkeys(requested, 0.0), 0.05)
         state = client.wait_state(lambda s: s.source != "jog", "at rest", 3.0)
     emit(state, "  ".join(f"{name} {value:+.4f}" for name, value in state.joints.items()), json)

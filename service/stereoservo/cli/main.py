@@ -1,5 +1,5 @@
-"""Entry point of the command line ``stereoservo``, which imports next to nothing: ``stop`` has raised the stop slot
-before the libraries of the commands are loaded.
+"""Entry point of the command line ``stereoservo``, with hardly any imports: ``stop`` has raised the stop slot before
+the libraries of the commands are loaded.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import sys
 from stereoservo.cli import interruption
 from stereoservo.cli.early_stop import raise_stop
 
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads cost more than they give here
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: its threads cost more than they gain
 
 
 def invoke(arguments: list[str]) -> int:
@@ -22,13 +22,11 @@ def invoke(arguments: list[str]) -> int:
 
 
 def _go_first() -> None:
-    """Let this process, a stop, go before other work of the computer, where the account may (root, or ``nice`` in
-    limits.conf).
-    """
+    """Raise the priority of this process, a stop, if the account is allowed to (root, or ``nice`` in limits.conf)."""
     try:
         os.setpriority(os.PRIO_PROCESS, 0, -20)
     except OSError:
-        return  # it goes with the others, as any command does
+        return  # ordinary priority, as for any other command
 
 
 def main() -> None:

@@ -18,7 +18,7 @@ EXIT_INTERRUPTED = 130
 
 
 def cells_beginning(incomplete: str) -> list[str]:
-    """Live cells and cell files whose names begin so, for the shell's completion."""
+    """Live cells and cell files whose names start so, for the shell's completion."""
     from stereoservo.messages.discovery import live_cells
 
     folder = Path(incomplete if incomplete.endswith("/") else Path(incomplete).parent)
@@ -27,13 +27,13 @@ def cells_beginning(incomplete: str) -> list[str]:
 
 
 def goals_beginning(ctx: typer.Context, incomplete: str) -> list[str]:
-    """Taught goals of the command's cell whose names begin so, for the shell's completion: the daemon is asked."""
+    """Taught goals of the command's cell whose names start so, for the shell's completion; queries the daemon."""
     from stereoservo.client import Client
 
     try:
         with Client(ctx.params["cell"], endpoint=ctx.params.get("endpoint")) as client:
             names = [goal.name for goal in client.info().taught]
-    except Exception:  # a prompt has no place for a message; the command itself says what is wrong
+    except Exception:  # a shell prompt has no place for a message; the command itself reports the error
         return []
     return [name for name in names if name.startswith(incomplete)]
 
@@ -58,7 +58,7 @@ OperatorOption = Annotated[
 
 
 class CommandError(Exception):
-    """A command failed. ``code`` is stable; ``data`` goes into the JSON beside the message."""
+    """A command failed. ``code`` is stable; ``data`` is added to the JSON along with the message."""
 
     def __init__(self, code: str, message: str, **data: Any) -> None:
         super().__init__(message)
@@ -76,18 +76,18 @@ def emit(result: Any, text: str, as_json: bool) -> None:
 
 
 def coloured(text: str, colour: str, stream: TextIO) -> str:
-    """The text in bold and that colour where the stream is a terminal, unless ``NO_COLOR`` is set."""
+    """The text in bold and that colour if the stream is a terminal, unless ``NO_COLOR`` is set."""
     return typer.style(text, fg=colour, bold=True) if stream.isatty() and not os.environ.get("NO_COLOR") else text
 
 
 def note(message: str) -> None:
-    """Print progress and remarks on stderr; a full disk there loses them alone."""
+    """Print progress and remarks on stderr; if that fails because of a full disk, only they are lost."""
     with suppress(OSError):
         print(message, file=sys.stderr, flush=True)
 
 
 def note_hold(kind: str, message: str, cell: str) -> None:
-    """Print that a motion which is waited for was held or resumed, with the way out; nothing for other events."""
+    """Print that a motion which is waited for was held or resumed, and how to continue; nothing for other events."""
     if kind == "held":
         note(f"{message}: nothing moves until `stereoservo resume {cell}`")
     elif kind == "resumed":
@@ -116,9 +116,7 @@ def code_of(error: BaseException) -> str:
 
 
 def known(error: BaseException) -> bool:
-    """Whether an exception is one that this project raises on purpose, so that its text suffices without a
-    traceback.
-    """
+    """Whether an exception is raised by this project on purpose, so that its text suffices without a traceback."""
     return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
 
 
@@ -155,7 +153,7 @@ def read_file(path: Path) -> bytes:
 
 def shipped_or_path(cell: str) -> Path:
     """Path of a cell file, or of the shipped one of that name. Raises BadParameter, PluginError."""
-    from stereoservo.ports import plugins  # not for verbs that need no file
+    from stereoservo.ports import plugins  # not for commands that need no file
 
     if cell.endswith(".toml") or Path(cell).exists():
         return Path(cell)

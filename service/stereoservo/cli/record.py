@@ -25,7 +25,7 @@ from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.wire import EventMessage
 
 LAST_WORD_S = 10.0
-"""The gateway gives its cameras 5 s to finish their files."""
+"""Time limit [s]; the gateway gives its cameras 5 s to finish their files."""
 
 
 def record(

@@ -1,5 +1,5 @@
-"""Command ``stereoservo status``: prints what a cell does now, the progress of its goal, and the reasons why it is
-slow, held or in fault. On the cell's host it believes the servo process itself, whatever becomes of the gateway.
+"""Command ``stereoservo status``: prints a cell's current activity, the progress of its goal, and the reasons why it is
+slow, held or in fault. On the cell's host it reads the servo process's own state, independent of the gateway.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from stereoservo.messages.servo_state import STATE_LAYOUT, decode_state, read_ru
 from stereoservo.messages.wire import EventMessage, StateMessage
 
 CAUSES = ("held", "stopped", "goal_aborted", "calibration_aborted", "ring_kept")
-"""Kinds of the events that tell why an arm stands."""
+"""Kinds of events that explain why an arm does not move."""
 RECENT_EVENTS = 100
 
 
@@ -49,7 +49,7 @@ def status(cell: CellArgument, endpoint: EndpointOption = None, json: JsonOption
 
 
 def with_progress(state: StateMessage, directories: CellDirectories) -> StateMessage:
-    """A state whose reason ``COMPILING`` says how many kernels are compiled, on the cell's own host."""
+    """A state whose reason ``COMPILING`` has the number of compiled kernels, on the cell's own host."""
     compiling = [one for one in read_progress(directories.runtime) if one.part == "rest"]
     reasons = tuple(
         msgspec.structs.replace(reason, hint=f"{compiling[0].words} are compiled. {reason.hint}")
@@ -61,7 +61,7 @@ def with_progress(state: StateMessage, directories: CellDirectories) -> StateMes
 
 
 def _causes(client: Client, state: StateMessage) -> list[str]:
-    """The last event of each kind that tells why an arm that is held, stopped or in fault stands, oldest first."""
+    """The last event of each kind that explains why an arm is held, stopped or in fault, oldest first."""
     if not any(reason.level in ("hold", "fault") for reason in state.reasons):
         return []
     recent: dict[str, EventMessage] = {}
@@ -78,7 +78,7 @@ def _causes(client: Client, state: StateMessage) -> list[str]:
 
 
 def _failure(code: str, words: str, state: StateMessage | None, as_json: bool) -> CommandError:
-    """The failure ``words``, with the last state that is known: printed, or in the JSON object of the error."""
+    """The failure ``words``, with the last known state: printed, or in the JSON object of the error."""
     if state is None:
         return CommandError(code, words)
     if not as_json:
@@ -134,7 +134,7 @@ def _joints(state: StateMessage) -> str:
 def _markers(state: StateMessage) -> str:
     """Text: number of markers that each camera sees and the age of its frame, or that it is unknown."""
     words = []
-    for camera in state.camera_age_s or state.visible:  # a daemon of before tells no ages
+    for camera in state.camera_age_s or state.visible:  # an older daemon sends no ages
         age_s = state.camera_age_s.get(camera)
         if camera in state.visible:
             words.append(f"{camera} {state.visible[camera]}{_age(age_s)}")
@@ -152,7 +152,7 @@ def _silence(what: str, age_s: float | None) -> str:
 
 
 def progress_words(state: StateMessage) -> str:
-    """Progress of the active goal as text; empty where it is unknown."""
+    """Progress of the active goal as text; empty if it is unknown."""
     words = []
     if state.progress is not None:
         words.append(f"{100.0 * state.progress:.0f} % of its path")
@@ -164,7 +164,7 @@ def progress_words(state: StateMessage) -> str:
 
 
 def _health(state: StateMessage) -> list[str]:
-    """Text: agreement of each camera with the model, the diagnosis where it is poor, and wrong stamps."""
+    """Text: agreement of each camera with the model, the diagnosis if it is poor, and wrong stamps."""
     health = state.health
     if health.verdict == "unknown" and not health.text:
         return []
@@ -211,13 +211,13 @@ GATEWAY_SILENT = (
 
 
 def servo_silence(directories: CellDirectories) -> str:
-    """Words on a servo process that gives no sign of life; '' where it does, or where nothing is known."""
+    """Text on a servo process that gives no sign of life; '' if it does, or if that is unknown."""
     silent = _silent(directories, "servo", SERVO_HANG_S)
     return "" if silent == "" else f"the servo process {silent}: it hangs or was stopped. {SERVO_SILENT}"
 
 
 def gateway_silence(directories: CellDirectories) -> str:
-    """Likewise of the gateway."""
+    """The same for the gateway."""
     silent = _silent(directories, "gateway", GATEWAY_HANG_S)
     return "" if silent == "" else f"the gateway {silent}. {GATEWAY_SILENT}"
 
@@ -225,12 +225,12 @@ def gateway_silence(directories: CellDirectories) -> str:
 def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
     try:
         reader = HeartbeatReader(directories.heartbeat_slot(process))
-    except SlotError:  # of a version without one
+    except SlotError:  # of a version without heartbeats
         return ""
     with closing(reader):
         beat = reader.newest()
         if beat is not None and beat.silent_s(usual_s):
-            time.sleep(AGAIN_S)  # this process itself may have stood
+            time.sleep(AGAIN_S)  # this process itself may have been suspended
             beat = reader.newest()
     silent_s = 0.0 if beat is None else beat.silent_s(usual_s)
     if not silent_s:
@@ -240,9 +240,9 @@ def _silent(directories: CellDirectories, process: str, usual_s: float) -> str:
 
 
 def newest_state(directories: CellDirectories) -> StateMessage | None:
-    """The newest state that the servo process wrote, as the gateway would tell it; None where it cannot be read.
+    """The newest state that the servo process wrote, in the gateway's format; None if it cannot be read.
 
-    Of a silent servo process: as it was when it wrote it.
+    The state of a silent servo process is reported as of the time when it was written.
     """
     try:
         run = read_run(directories.runtime)

@@ -14,7 +14,9 @@ from stereoservo.messages.locks import holder
 from stereoservo.messages.wire import Reply
 
 ACKNOWLEDGE_S = 1.0
-"""The servo process takes a stop in its next cycle, a few milliseconds later; a busy machine stalls it for tenths."""
+"""Time limit [s]. The servo process applies a stop in its next cycle, a few milliseconds later; a busy machine delays
+it by tenths of a second.
+"""
 
 NOT_TAKEN = (
     "Drives stop by themselves without commands; where the arm still moves, use the emergency stop. A servo process "
@@ -37,7 +39,7 @@ def stop(context: typer.Context, cell: CellArgument, endpoint: EndpointOption = 
 
 
 def _await_acknowledgement(raised: RaisedStop) -> None:
-    """Wait until the servo process, which nobody can speak for, has taken the stop. Raises CommandError."""
+    """Wait until the servo process itself has acknowledged the stop. Raises CommandError."""
     until = time.monotonic() + ACKNOWLEDGE_S
     while not raised.slot.acknowledged(raised.word):
         runs = holder(raised.directories.servo_lock) is not None

@@ -22,12 +22,12 @@ KINDS = {"points": "points", "displacement": "displacement", "incidence": "incid
 """Options that take a target as a file, and its kind."""
 SOURCES = ("triangulated", "predicted")
 PLANNED_LAW = "trajectory"
-"""Whose plan ends in a posture of choice."""
+"""Law whose plan can end in a chosen posture."""
 
 
 class StreamLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One line of a stream: set-points, or points with the epoch of their model; ``stamp_s``: time at which they
-    hold.
+    """One line of a stream: set-points, or points with the epoch of their model; ``stamp_s``: time at which they are
+    valid.
     """
 
     stamp_s: float | None = None
@@ -46,7 +46,7 @@ def target_tree(
     lines: str | None = None,
     planes: str | None = None,
 ) -> dict[str, Any]:
-    """The target as on the wire. Exactly one of a name, joints, set-points or a file of ``files`` must be given."""
+    """The target in wire format. Exactly one of a name, joints, set-points or a file of ``files`` must be given."""
     given = [bool(name), bool(joints), set_points is not None, *(path is not None for path in files.values())]
     if sum(given) != 1:
         raise CommandError(
@@ -117,9 +117,7 @@ def adaptive(text: str) -> dict[str, float]:
 
 
 def make_goal(target: dict[str, Any], **options: Any) -> Goal:
-    """A goal with an id of its own; options that are None take the cell's defaults, those with a posture the law that
-    plans.
-    """
+    """A goal with a new id; options that are None have the cell's defaults, those with a posture the planning law."""
     tree = {"id": str(uuid.uuid4()), "target": target, **options}
     given = {key: value for key, value in tree.items() if value is not None}
     if "posture" in given:
@@ -128,7 +126,7 @@ def make_goal(target: dict[str, Any], **options: Any) -> Goal:
 
 
 def stream_lines(source: str) -> Iterator[tuple[float | None, StreamedTarget]]:
-    """Set-points with their stamps from JSON lines of a file, or of stdin (``-``), as they come.
+    """Set-points with their stamps from JSON lines of a file, or of stdin (``-``), as they arrive.
 
     Those of a file are paced by their stamps. Raises CommandError naming the line.
     """

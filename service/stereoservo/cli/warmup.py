@@ -44,14 +44,14 @@ def warmup(
 
 
 def _compile() -> int:
-    """Compile in a process of its own, and tell how far it is; returns its exit code."""
+    """Compile in a separate process, and print its progress; returns its exit code."""
     with TemporaryDirectory(prefix="stereoservo-warmup-") as told:
         command = [sys.executable, "-m", "stereoservo.daemon.kernel_compilation", str(os.getpid()), "alone", told]
         with subprocess.Popen(command, env=child_environment(), stdout=sys.stderr) as process:
             try:
                 return _wait(process, Path(told))
             finally:
-                process.kill()  # it leaves Ctrl-C to this command
+                process.kill()  # Ctrl-C is handled by this command alone
 
 
 def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
@@ -67,7 +67,7 @@ def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
 
 
 def _warm_up_detectors(cell: str) -> None:
-    """Make the drivers and detectors of a cell, which compiles what they are missing. Raises as `make_plan`."""
+    """Construct the drivers and detectors of a cell, which compiles missing kernels. Raises as `make_plan`."""
     from stereoservo.daemon.cell_preparation import (  # not for --help: numerical libraries
         PlanOptions,
         make_plan,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 HOST_NAME = re.compile(r"[A-Za-z0-9._-]+|[0-9A-Fa-f:.]+")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 END_S = 20.0
-"""From Ctrl-C to an end by force. Pages are given 2 s, the link 6 s, then other threads `THREADS_S`."""
+"""Time from Ctrl-C to an end by force [s]. Pages are given 2 s, the link 6 s, then other threads `THREADS_S`."""
 THREADS_S = 1.0
 
 
@@ -92,7 +92,7 @@ def web(
         if len(tokens) > 1 or not json:
             note(f"token to command the arm as {operate}, good for one use: {token}")
 
-    interruption.check()  # one that was lost while packages were imported
+    interruption.check()  # an interrupt that was lost while packages were imported
     with interruption.ending(END_S) as ending:
         server = PageServer(make_link, operate, announce)
         asyncio.run(_serve(server, address, port, context, host or [], tokens, json, ending))
@@ -103,7 +103,7 @@ def web(
 
 
 def _check_names(hosts: list[str], operator: str | None) -> None:
-    """Raises CommandError for a host or an operator that is no name."""
+    """Raise CommandError for an invalid host or operator name."""
     for name in hosts:
         if not HOST_NAME.fullmatch(name):
             raise CommandError(

@@ -15,15 +15,16 @@ from stereoservo.messages.wire import MessageError, Reply
 
 LOG_INTERVAL_S = 1.0
 MAX_TEXT_CHARS = 2000
-"""Of a refusal or a line of the log: both may quote a message of 64 KiB, and the last 2 000 events are kept."""
+"""Maximum length of a refusal or a log line: both may quote a message of 64 KiB, and the last 2 000 events are stored.
+"""
 EXPECTED_ERRORS = (MessageError, InvalidKeyError, TransferError)
-"""What the gateway's own checks raise; their texts are made for clients."""
+"""Exceptions raised by the gateway's own checks; their texts are written for clients."""
 
 
 class RateLimit:
-    """Limit of what clients can cause at will: ``burst`` at once, and one a second after that.
+    """Rate limit of actions that clients can cause: a ``burst`` at once, then one per second.
 
-    ``held_back``: number of those since the last one that passed.
+    ``held_back``: number of rejected occurrences since the last accepted one.
     """
 
     def __init__(self, burst: int) -> None:
@@ -45,7 +46,7 @@ class RateLimit:
 
 
 class LimitedLog:
-    """Rate-limited log of what clients can cause at will: at most a line a second; ``count``: of all occurrences."""
+    """Log of occurrences that clients can cause, at most one line per second; ``count``: all occurrences."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -60,14 +61,14 @@ class LimitedLog:
 
 
 class Boundary:
-    """Error boundary of one thread. ``refusals`` counts and logs messages whose handling raised."""
+    """Error boundary of one thread. ``refusals`` counts and logs messages whose handling raised an exception."""
 
     def __init__(self, boot: str) -> None:
         self.refusals = LimitedLog()
         self._boot = boot
 
     def take(self, key: str, work: Callable[[], None], refuse: Callable[[Reply], None]) -> None:
-        """Do ``work`` for a message received on ``key``; where it raises, call ``refuse`` with the refusal."""
+        """Do ``work`` for a message received on ``key``; if it raises, call ``refuse`` with the refusal."""
         try:
             work()
         except Exception as error:

@@ -1,5 +1,5 @@
-"""Jobs of calibration, model check and zero reset in the gateway: collects the samples of the motion, runs the fit or
-check in a child process, stores the new model and sends it to the core.
+"""Jobs of calibration, model check and zero reset in the gateway: collect the samples of the motion, run the fit or
+check in a child process, store the new model and send it to the core.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from stereoservo.messages.wire import CalibrationResult
 
 
 class CalibrationJobs:
-    """The cell's model and the jobs that produce it. ``model`` is the one sent to the core last.
+    """The cell's model and the jobs that produce it. ``model`` is the last one sent to the core.
 
-    ``notes``: what is wrong with the model files, until a newer model is there.
+    ``notes``: problems of the model files, until a newer model is available.
     """
 
     def __init__(
@@ -58,7 +58,7 @@ class CalibrationJobs:
         return self._fit is not None or self._check is not None or self._handed is not None
 
     def load(self, core_epoch: int) -> None:
-        """Send the newest fitting model on disk to the core, unless that (epoch ``core_epoch``) has it."""
+        """Send the newest fitting model on disk to the core, unless the core (epoch ``core_epoch``) already has it."""
         try:
             model, passed = self._models.newest_fitting(self._settings, recover=True)
         except OSError as error:
@@ -67,7 +67,7 @@ class CalibrationJobs:
         self.notes = tuple(f"model passed over: {text}; {used}" for text in passed)
         for text in self.notes:
             self._log.add("warning", message=text, origin="gateway")
-        # Given again to a core that has it, after a restart of the gateway, it would lose its estimates.
+        # Not sent again, after a restart of the gateway, to a core that has it: that would reset the core's estimates.
         if model is not None and (model.epoch == core_epoch or self._link.send_model(model)):
             self.model = model
 
@@ -84,7 +84,7 @@ class CalibrationJobs:
             self._failed(goal_id, event.message)
 
     def take_epoch(self, epoch: int) -> None:
-        """The core works with the model of ``epoch``: where that is the one that was handed over, it is reported."""
+        """Handle the core's change to the model of ``epoch``: report it if it is the model that was sent."""
         if self._handed is None or epoch < self._handed[1].epoch:
             return
         (goal_id, what), self._handed = self._handed, None
@@ -159,7 +159,7 @@ class CalibrationJobs:
             self._poll_check(self._check)
 
     def _poll_fit(self, fit: FitJob) -> None:
-        ended = fit.ended  # read first, so that the output before the end is processed, too
+        ended = fit.ended  # read first, so that output printed before the end is processed, too
         for step in fit.poll():
             self._log.add(
                 "fit_progress",
@@ -206,7 +206,7 @@ class CalibrationJobs:
         self._send_to_core(model, self._fit_id, result, fit.model_path)
 
     def _send_to_core(self, model: CellModel, goal_id: str, what: CalibrationResult | ZeroReset, path: Path) -> None:
-        """Send a model to the core, which applies it once the arm is at rest; ``what`` is reported then."""
+        """Send a model to the core, which applies it once the arm is at rest; ``what`` is then reported."""
         if not self._link.send_model(model):
             self._failed(goal_id, f"the servo process does not take the model; it is saved as {path}")
             return

@@ -27,7 +27,7 @@ FIT_TIMEOUT_S = 600.0
 
 
 class FitFailedError(Exception):
-    """A fit gave no model, or a check no report; ``code`` is the calibration's."""
+    """A fit yielded no model, or a check no report; ``code`` is the calibration's error code."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -42,7 +42,7 @@ class FitProgress(msgspec.Struct, frozen=True):
 
 
 class ChildJob:
-    """A child process that prints JSON objects, one a line. ``said`` holds all but the progress."""
+    """A child process that prints JSON objects, one per line. ``said`` holds all of them except progress."""
 
     def __init__(self, module: str, *arguments: str) -> None:
         self._started = time.monotonic()
@@ -79,7 +79,7 @@ class ChildJob:
 
     @property
     def seconds(self) -> float:
-        """Its run time [s]."""
+        """Run time of the process [s]."""
         return time.monotonic() - self._started
 
     @property
@@ -90,14 +90,14 @@ class ChildJob:
         return self._process.poll() is not None
 
     def finished(self) -> bool:
-        """Whether it has ended, with all that it said taken in; of its progress nothing is told."""
-        ended = self.ended  # asked first, so that the output before the end is taken in, too
+        """Whether the process has ended, with all its output read; its progress is dropped."""
+        ended = self.ended  # read first, so that output printed before the end is processed, too
         for _ in self.poll():
             pass
         return ended
 
     def require(self, key: str) -> Any:
-        """The value printed under ``key``. Raises FitFailedError with the child's own error, or with how it ended."""
+        """The value printed under ``key``. Raises FitFailedError with the child's own error or exit status."""
         if key in self.said:
             return self.said[key]
         if failure := self.said.get("error"):
@@ -109,13 +109,13 @@ class ChildJob:
         raise FitFailedError("fit_process", f"the process ended with exit code {code}: {last}")
 
     def close(self) -> None:
-        """Terminate it and release its resources. Idempotent."""
+        """Terminate the process and release its resources. Idempotent."""
         self.cancel()
         self._output.close()
         self._errors.close()
 
     def cancel(self) -> None:
-        """Terminate it. Idempotent."""
+        """Terminate the process. Idempotent."""
         if self._process.poll() is None:
             self._process.kill()
             self._process.wait()
@@ -145,7 +145,7 @@ class FitJob(ChildJob):
         return "model" in self.said or "error" in self.said or self.ended
 
     def model(self) -> tuple[CellModel, Acceptance, float]:
-        """The model, its notes, and the seconds that the fit took. Raises FitFailedError, ModelFileError."""
+        """The model, its notes, and the duration of the fit [s]. Raises FitFailedError, ModelFileError."""
         self.require("model")
         if self._seconds is None:
             self._seconds = self.seconds
@@ -153,7 +153,7 @@ class FitJob(ChildJob):
 
 
 class CheckJob(ChildJob):
-    """A running check of a model. ``reset_to``: file for a model, of ``epoch``, with drifted joint zeros reset."""
+    """A running check of a model. ``reset_to``: file for a model, with ``epoch``, with drifted joint zeros reset."""
 
     def __init__(
         self, check: TrialData, model_path: Path, history: Path, limit_px: float, *, body_moves: bool = False,
@@ -192,7 +192,7 @@ def calibration_result(
     trials: Path | None,
     seconds: float,
 ) -> CalibrationResult:
-    """Figures of a fit for clients. Raises FitFailedError where the model carries no statistics."""
+    """Figures of a fit for clients. Raises FitFailedError if the model has no statistics."""
     statistics = model.statistics
     if statistics is None:
         raise FitFailedError("no_statistics", f"{path}: the fitted model carries no statistics")

@@ -1,9 +1,8 @@
-"""Set-points of taught goals, reprojected for a moved workpiece, other cameras or a marker body that was mounted anew
-(thesis 8.6).
+"""Set-points of taught goals, reprojected for a moved workpiece, other cameras or a remounted marker body (thesis 8.6).
 
-A goal keeps the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. What
-stood still relative to the goal, the ``common`` markers, gives the map from the frame of teaching to the present one
-(`geometry.alignment`); the goal's points go along and are projected again. Nothing here waits or moves.
+A goal stores the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. The
+``common`` markers, which are static relative to the goal, determine the map from the frame of teaching to the current
+one (`geometry.alignment`); the goal's points are mapped by it and projected again. Nothing here blocks or moves.
 """
 
 from __future__ import annotations
@@ -42,7 +41,7 @@ from stereoservo.messages.goals import FeatureTarget, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
 
 MOUNTED_PX = 5.0
-"""Where cameras alone have changed, goal and kinematics agree within this, or the body was remounted."""
+"""Tolerance within which goal and kinematics agree if only cameras changed; otherwise the body was remounted."""
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,8 @@ def resolve(
 def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
     """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
-    Re-anchoring keeps the frame, to the bit: the goal's points are still what the cameras of teaching make of it.
-    Mobile cameras are re-estimated within one epoch.
+    Relocalization keeps the frame, bit for bit: the goal's points are still those triangulated with the cameras of
+    teaching. Mobile cameras are re-estimated within one epoch.
     """
     taught = goal.model
     if model is None or taught is None or not _same_frame(taught, model):
@@ -108,7 +107,7 @@ def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
         if then.get(camera.name) != (tuple(camera.matrix.ravel().tolist()), tuple(camera.lens.tolist()))
     ]
     kept_pixels = {name: pixels for name, pixels in goal.target.set_points.items() if name not in moved}
-    if not moved:  # other joint zeros, say: whether the goal holds is the core's to judge
+    if not moved:  # e.g. other joint zeros: the core checks whether the goal is valid
         return TransferredGoal(goal.target, "")
     if not set(moved) & set(goal.target.set_points):
         return TransferredGoal(FeatureTarget(kept_pixels, model.epoch), "")
@@ -183,7 +182,7 @@ def _common_change(
 
 
 def _common(requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations) -> list[int]:
-    """Common markers by id: those requested, or all that were observed then and are observed now."""
+    """Common markers by id: the requested ones, or all that were observed at teaching and are observed now."""
     then = {marker for points in goal.others.values() for marker in points} - set(goal.tool)
     now = {marker for points in observations.values() for marker in points} - set(model.marker_ids)
     for marker in requested.common:
@@ -213,8 +212,8 @@ def _points_when_taught(
 ) -> tuple[FloatArray, FloatArray, list[int]]:
     """Points (n, 4) of the body's markers at the goal in the frame of teaching, with covariances and ids.
 
-    From the taught pixels or, where the goal is defined by a tool's features, from the present pose of the body on
-    that tool, so that remounting the body does not change the goal.
+    They are computed from the taught pixels or, if the goal is defined by a tool's features, from the current pose of
+    the body on that tool, so that remounting the body does not change the goal.
     """
     tool = list(goal.tool)
     if not set(tool) <= set(model.marker_ids):
@@ -271,8 +270,7 @@ def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int],
 def _relative_to_cameras(
     requested: TaughtTarget, goal: TaughtGoal, model: CellModel, observations: MarkerObservations, same: bool
 ) -> TransferredGoal:
-    """Set-points with cameras on the arm: the goal is relative to the common markers, which the static body belongs
-    to.
+    """Set-points with cameras on the arm: the goal is relative to the common markers; the static body belongs to them.
 
     The common markers are on a workpiece that has moved within the scene (relative to the model's body).
     """

@@ -1,7 +1,7 @@
 """Intake of clients' goals and commands: decodes and validates them, forwards them to the servo process, and returns
-its reply. Stop and enable have a thread and a session of their own.
+its reply. Stop and enable have their own thread and session.
 
-Nothing in the intake waits: an unanswered request is kept with its deadline.
+Nothing in the intake blocks: an unanswered request is stored with its deadline.
 """
 
 from __future__ import annotations
@@ -48,13 +48,13 @@ from stereoservo.messages.wire import Reply, RunningGoal, RunningGoals, decode, 
 
 REPLY_TIMEOUT_S = 1.0
 PLANNED_REPLY_TIMEOUT_S = 5.0
-"""A goal is planned, a slice a cycle, before it is answered."""
+"""Time for the answer to a goal: it is planned first, one slice per cycle."""
 RESET_REPLY_TIMEOUT_S = 10.0
-"""A driver that reconnects and configures its drives does not reply meanwhile."""
+"""A driver that reconnects and configures its drives does not reply in that time."""
 PATIENCE_S: dict[type, float] = {RunGoal: PLANNED_REPLY_TIMEOUT_S, Reset: RESET_REPLY_TIMEOUT_S}
 KNOWN_GOALS = 1000
 REPORTED_AT_ONCE = 10
-"""Goals that were put have no reply: their refusals are events, so many at once and one a second after that."""
+"""Goals sent as puts have no reply. Their refusals are events: this many at once, then one per second."""
 
 
 @dataclass
@@ -161,7 +161,7 @@ class Intake:
         goal = decode(payload, Goal)
         known = None if goal.check else self._goals.get(goal.id)
         if known is not None and known.accepted:
-            if goal.lease_s is not None:  # the goal put again is its renewal
+            if goal.lease_s is not None:  # a goal that is put again is its renewal
                 return operator, RenewGoal(goal.id)
             raise _Answered(known)
         self._require(check_goal(goal, self._context()), "the goal is not valid", goal.id)
@@ -232,12 +232,12 @@ class Intake:
         self._answer(pending.query, reply, pending.operator, streamed)
 
     def core_event(self, event: Event) -> None:
-        """Handle an event of the core: a goal that ended runs no longer."""
+        """Handle an event of the core: a goal that ended is removed."""
         if event.kind in TERMINAL:
             self._running.pop(event.id, None)
 
     def running(self) -> RunningGoals:
-        """Goals that this gateway saw accepted and that have not ended."""
+        """Goals that were accepted through this gateway and have not ended."""
         return RunningGoals(tuple(self._running.values()))
 
     def expire(self) -> None:
@@ -280,7 +280,7 @@ class Intake:
 
 
 def payload_of(message: Any) -> bytes:
-    """Payload bytes of a query or a sample; empty where there are none."""
+    """Payload bytes of a query or a sample; empty if it has none."""
     return b"" if message.payload is None else bytes(message.payload.to_bytes())
 
 
@@ -297,15 +297,15 @@ NAMELESS = "a client that gives no name"
 
 
 def sender(message: Any) -> str:
-    """Who stops the arm, by the payload of a sample or query on ``command/stop``."""
+    """Name of the operator who stops the arm, from the payload of a sample or query on ``command/stop``."""
     try:
         return msgspec.json.decode(payload_of(message), type=Stop).operator
-    except Exception:  # whatever the payload is, the arm is stopped
+    except Exception:  # the arm is stopped whatever the payload is
         return NAMELESS
 
 
 class StopThread:
-    """Handles stop and enable on a session of its own, so that no load on other keys delays them."""
+    """Handles stop and enable on a separate session, so that load on other keys does not delay them."""
 
     def __init__(self, config: dict[str, Any], keys: KeySpace, plan: RunPlan, boot: str) -> None:
         self._session = open_session(config)
@@ -324,19 +324,19 @@ class StopThread:
         self._thread.start()
 
     def stopped_by(self, t_ns: int) -> str:
-        """Who sent the stop that the core took at ``t_ns``, once; '' where it did not come over the wire."""
+        """Sender of the stop that the core applied at ``t_ns``, returned once; '' if it did not arrive by zenoh."""
         asked, self._asked = self._asked, None
         return asked[0] if asked is not None and asked[1] <= t_ns else ""
 
     @property
     def refused(self) -> int:
-        """Number of messages that could not be taken."""
+        """Number of messages that could not be handled."""
         return self._boundary.refusals.count
 
     def _work(self) -> None:
         while not self._ending.is_set():
             try:
-                # Only the exact key: looking around with a wildcard must not stop the arm.
+                # Only the exact key: a query with a wildcard must not stop the arm.
                 while (sample := self._puts.try_recv()) is not None:
                     if str(sample.key_expr) == self._key:
                         self._raise_stop(sample)
@@ -347,13 +347,13 @@ class StopThread:
                         query.drop()
                 while (query := self._enables.try_recv()) is not None:
                     self.enables.append(query)
-            except zenoh.ZError:  # closed under our hands at the end
+            except zenoh.ZError:  # the session was closed by `close`
                 return
             self._ending.wait(STOP_POLL_S)
 
     def _raise_stop(self, message: Any) -> int:
-        """Raise the stop; ``message``: the sample or query that asks for it."""
-        self._asked = sender(message), time.monotonic_ns()  # before its event can come
+        """Raise the stop; ``message``: the sample or query that requests it."""
+        self._asked = sender(message), time.monotonic_ns()  # before its event can arrive
         return self._slot.raise_stop()
 
     def _stop(self, query: Any) -> None:

@@ -1,4 +1,4 @@
-"""Observations of markers as arrays, undistorted pixels with their cameras, of a taught goal or of the newest frames;
+"""Observations of markers as arrays of undistorted pixels with their cameras, from a taught goal or the newest frames;
 and the projective frame of a goal's or the current model.
 """
 
@@ -20,14 +20,16 @@ from stereoservo.kinematics.model import CellModel, Stratum
 from stereoservo.numerics.arrays import FloatArray
 
 UNKNOWN_SIGMA_PX = 0.1
-"""Of a pixel whose deviation was not kept (goals of schema 1)."""
+"""Standard deviation [px] of a pixel that was stored without one (goals of schema 1)."""
 
 
 @dataclass(frozen=True)
 class MarkerViews:
-    """Observations of markers ``ids`` in several cameras: ``Ps`` (c, 3, 4), ``lenses`` (c, 4), ``sizes`` (c, 2);
-    ``pixels`` (c, n, 2) ideal, NaN where not seen, ``sigmas`` (c, n) [px]. ``scene`` (m, 4): points that are in
-    front of all cameras.
+    """Observations of markers ``ids`` in several cameras.
+
+    ``Ps`` (c, 3, 4), ``lenses`` (c, 4), ``sizes`` (c, 2): the cameras.
+    ``pixels`` (c, n, 2): ideal, NaN if not seen; ``sigmas`` (c, n) [px].
+    ``scene`` (m, 4): points that are in front of all cameras.
     """
 
     cameras: tuple[str, ...]
@@ -55,13 +57,13 @@ class MarkerViews:
         )
 
     def add(self, camera: str, seen: Mapping[int, tuple[tuple[float, float], float]]) -> None:
-        """Enter raw pixels with their deviations; cameras and markers outside of these views are ignored."""
+        """Enter raw pixels with their standard deviations; cameras and markers outside of these views are ignored."""
         known = [marker for marker in seen if marker in self.ids]
         if camera not in self.cameras or not known:
             return
         c, rows = self.cameras.index(camera), [self.ids.index(marker) for marker in known]
         ideal = undistort(self.lenses[c], np.array([seen[marker][0] for marker in known]))
-        there = np.flatnonzero(np.isfinite(ideal).all(axis=1))  # the others lie beyond the lens's fold
+        there = np.flatnonzero(np.isfinite(ideal).all(axis=1))  # others are beyond the lens model's fold
         bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal[there]))))
         kept = [rows[k] for k in there]
         self.pixels[c, kept] = ideal[there]
@@ -78,7 +80,9 @@ class MarkerViews:
         return MarkerViews(self.cameras, self.Ps, self.lenses, self.sizes, list(ids), pixels, sigmas, self.scene)
 
     def points(self) -> tuple[FloatArray, FloatArray]:
-        """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN where not seen twice."""
+        """Points (n, 4) at depth 1 in the first camera and their covariances (n, 4, 4); NaN if seen by fewer than two
+        cameras.
+        """
         points = triangulate(self.Ps, self.pixels, self.sigmas, iterations=6)
         covariance = np.full((len(points), 4, 4), np.nan)
         known = np.isfinite(points).all(axis=1)
@@ -87,7 +91,7 @@ class MarkerViews:
         return points, covariance
 
     def front_signs(self) -> FloatArray:
-        """``(c,)``: the sign of the third row's product with a point in front of each camera, 1 for the first."""
+        """Sign (c,) of the product of each camera's third row with a point in front of it, 1 for the first camera."""
         depths = self.scene @ self.Ps[:, 2].T
         depths = depths * np.sign(depths[:, :1])
         return np.where((depths > 0).sum(axis=0) * 2 >= len(self.scene), 1.0, -1.0)

@@ -1,6 +1,6 @@
-"""Jobs of the gateway that bring the model in use up to date: relocalization of moved cameras on request of the core,
-and on-line refinement by the rest poses of goals. Each collects observations at rest, computes a new model in a child
-process, and sends it to the core. Also stores cameras that the core re-estimated.
+"""Jobs of the gateway that update the model in use: relocalization of moved cameras on request of the core, and on-line
+refinement by the rest poses of goals. Each collects observations at rest, computes a new model in a child process, and
+sends it to the core. Also stores cameras that the core re-estimated.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ class RelocalizationJob(ChildJob):
         )
 
     def report(self) -> tuple[CellModel, RelocalizationReport]:
-        """The new model and a message on it. Raises FitFailedError, ModelFileError."""
+        """The new model and a message about it. Raises FitFailedError, ModelFileError."""
         report = msgspec.convert(self.require("reanchored"), RelocalizationReport)
         return load_model(Path(report.model)), report
 
 
 class RelocalizationJobs:
-    """Handles the core's events ``reanchor``. ``model``: returns the model in use, ``take`` replaces it."""
+    """Handles the core's events ``reanchor``. ``model`` returns the model in use, ``take`` replaces it."""
 
     def __init__(
         self,
@@ -88,7 +88,7 @@ class RelocalizationJobs:
             self._keep_adjusted(event)
 
     def take_epoch(self, epoch: int) -> None:
-        """The core works with the model of ``epoch``."""
+        """Handle the core's change to the model of ``epoch``."""
         if self._handed is not None and epoch >= self._handed.epoch:
             handed, self._handed = self._handed, None
             if epoch == handed.epoch:
@@ -124,7 +124,7 @@ class RelocalizationJobs:
             self._refuse(str(error))
 
     def poll(self) -> None:
-        """Once the process has ended, send its model to the core, or report why there is none."""
+        """Once the process has ended, send its model to the core, or report why it has none."""
         fit = self._fit
         if fit is None or not fit.finished():
             return
@@ -173,11 +173,11 @@ def with_matrix(model: CellModel, camera: str, matrix: FloatArray) -> CellModel:
 
 
 class RefinementJobs:
-    """On-line refinement of the model in use by rest poses of goals; ``on``: whether it is wanted.
+    """On-line refinement of the model in use by rest poses of goals; ``on``: whether it is enabled.
 
-    Poses count while the watch over the model finds nothing; a verdict drops them all. With `LEAST_POSES`, and whenever
-    their number has doubled since, a child process refines the calibrated model. What it gives is taken in while no
-    goal runs, with the taught goals; the calibrated model stays, and `restore` brings it back.
+    Poses are used while the model monitor finds nothing; any diagnosis discards them all. With `LEAST_POSES`, and
+    whenever their number has doubled since, a child process refines the calibrated model. The result is applied while
+    no goal runs, also to the taught goals; the calibrated model is kept, and `restore` returns to it.
     """
 
     def __init__(
@@ -199,16 +199,16 @@ class RefinementJobs:
         self._job: ChildJob | None = None
         self._found: tuple[CellModel, RefinementReport] | None = None
         self._handed: tuple[int, int, str] | None = None
-        """Epoch that is replaced, the one that replaces it, and what is told once the core works with it."""
+        """Replaced epoch, new epoch, and the message reported once the core uses the new one."""
         self._idle = False
 
     def take_frame(self, observation: CameraObservation) -> None:
-        """A camera's newest observation."""
+        """Add a camera's newest observation."""
         if self._on:
             self._poses.add_frame(observation)
 
     def take_state(self, status: Status) -> None:
-        """The core's newest state: a rest pose, or what ends the collection."""
+        """Handle the core's newest state: a rest pose, or a condition that ends the collection."""
         if self._handed is not None and status.model_epoch == self._handed[0]:
             self._poses.leave()
             return
@@ -231,7 +231,7 @@ class RefinementJobs:
             self._poses.leave()
 
     def state(self) -> RefinementState | None:
-        """How far the refinement is; None where nothing is refined."""
+        """Progress of the refinement; None if nothing is refined."""
         if not self._on:
             return None
         model, poses = self._calibration.model, len(self._poses.poses)
@@ -244,7 +244,7 @@ class RefinementJobs:
         )
 
     def _trusted(self, status: Status) -> bool:
-        """Whether the core itself goes by all cameras and their stamps, with a valid model, and does not calibrate."""
+        """Whether the core uses all cameras and their stamps, with a valid model, and does not calibrate."""
         return (
             status.model == "valid"
             and status.health.verdict == "ok"
@@ -255,7 +255,7 @@ class RefinementJobs:
         )
 
     def _forget(self, why: str) -> None:
-        """Drop all poses, and what is being made of them."""
+        """Drop all poses, and the running refinement."""
         dropped = len(self._poses.poses)
         self._poses.clear()
         self._due = MOST_POSES + 1 if self._undone else LEAST_POSES
@@ -264,7 +264,7 @@ class RefinementJobs:
         self.cancel()
 
     def poll(self) -> None:
-        """Start a refinement that is due, handle the result of one, take in a model while no goal runs."""
+        """Start a refinement that is due, handle a finished one, apply a model while no goal runs."""
         if not self._on:
             return
         if self._job is not None:
@@ -312,15 +312,16 @@ class RefinementJobs:
         job.close()
 
     def _hand_over(self, used: CellModel, found: CellModel, why: str) -> bool:
-        """Use ``found`` in the place of ``used``: a new epoch, for the goals that were taught, too. False: all is as
-        it was, and told why. The model's file commits: after a crash the next start restates the goals by what it says
-        (`complete_hand_over`).
+        """Replace ``used`` by ``found``, with a new epoch, also for the taught goals. Returns whether that succeeded;
+        if not, nothing has changed and the reason is reported.
+
+        The model's file is the commit: after a crash the next start restates the goals by it (`complete_hand_over`).
         """
         epoch = self._models.next_epoch()
         model = msgspec.structs.replace(found, epoch=epoch, in_place_of=used.epoch)
         before = self._taught.goals
         try:
-            # From here on the next start has this model, and its goals.
+            # From here on the next start uses this model, and its goals.
             save_model(model, self._models.path(epoch))
             self._taught.refine(used, model)
         except (OSError, ModelFileError) as error:
@@ -337,8 +338,8 @@ class RefinementJobs:
         return True
 
     def _take_back(self, epoch: int, goals: dict[str, TaughtGoal]) -> str:
-        """Undo a hand-over, the model's file last: while it is there, the next start completes what was begun. Returns
-        what of it stays, in words.
+        """Undo a hand-over, deleting the model's file last: while it exists, the next start completes the hand-over.
+        Returns a text on what could not be undone.
         """
         try:
             self._taught.put_back(goals)
@@ -348,7 +349,7 @@ class RefinementJobs:
         return ""
 
     def complete_hand_over(self) -> None:
-        """Restate the taught goals in the model in use, where a crash came before that. At the start, once."""
+        """Restate the taught goals in the model in use, if a crash prevented it. Called once, at the start."""
         model = self._calibration.model
         if model is None or not model.in_place_of:
             return
@@ -371,8 +372,8 @@ class RefinementJobs:
         self._log.add("warning", message=message, origin="gateway")
 
     def restore(self) -> str:
-        """Bring the calibrated model back that the one in use was refined from, and refine no more until the next
-        calibration or start. Returns what is done. Raises MessageError.
+        """Return to the calibrated model from which the one in use was refined, and refine no more until the next
+        calibration or start. Returns a description. Raises MessageError.
         """
         used = self._calibration.model
         if used is None or not used.refined_from:

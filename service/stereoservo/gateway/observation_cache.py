@@ -1,5 +1,5 @@
-"""Cache of the newest observations of all markers by camera, averaged over frames while a marker is static, and of one
-moment where it moves.
+"""Cache of the newest observations of all markers by camera: averaged over frames for a static marker, interpolated to
+a common time for a moving one.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ from stereoservo.ports.devices import CameraObservation
 
 FRAMES = 10
 FRESH_S = 1.0
-"""An older frame is not used."""
+"""Maximum age of a frame [s]; older ones are not used."""
 STILL_SIGMAS = 6.0
 STILL_PX = 0.2
-"""A marker within so many deviations plus this of its mean is static."""
+"""A marker is static within this many standard deviations plus this offset of its mean."""
 
 
 class MarkerObservation(NamedTuple):
@@ -35,7 +35,7 @@ MarkerObservations = Mapping[str, Mapping[int, MarkerObservation]]
 
 
 class ObservationCache:
-    """The last frames of each camera. ``systematic_px`` by camera: error that does not average out."""
+    """The last frames of each camera. ``systematic_px`` by camera: error that averaging does not reduce."""
 
     def __init__(self, systematic_px: Mapping[str, float]) -> None:
         self._systematic = dict(systematic_px)
@@ -70,7 +70,7 @@ class ObservationCache:
 
 
 class _Sight(NamedTuple):
-    """Where a marker was seen (2,) [px], with its variance [px²], at this time [s] since the moment that counts."""
+    """Where a marker was seen (2,) [px], with its variance [px²], at a time [s] relative to the reference time."""
 
     since_s: float
     pixel: FloatArray
@@ -78,7 +78,7 @@ class _Sight(NamedTuple):
 
 
 def _average(track: list[_Sight], systematic: float) -> MarkerObservation:
-    """Mean pixel of a static marker; of a moving one where it was at the moment that all cameras have seen."""
+    """Mean pixel of a static marker; for a moving one, its pixel at the latest time that all cameras have observed."""
     pixels = np.array([sight.pixel for sight in track])
     variance = float(np.mean([sight.variance for sight in track]))
     mean = pixels.mean(axis=0)

@@ -1,5 +1,5 @@
-"""Files that the gateway keeps: stores of taught goals and models, and the journal, a log of events. None of them ends
-the gateway: what is damaged is set aside, what cannot be written is told.
+"""Files of the gateway: stores of taught goals and models, and the journal, a log of events. No failure ends the
+gateway: damaged files are set aside, and failed writes are reported.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from stereoservo.messages.wire import EventMessage
 
 JOURNAL_BYTES = 10_000_000
 REOPEN_S = 1.0
-"""How often a journal that could not be opened is tried again."""
+"""Interval of attempts to open a journal that could not be opened [s]."""
 Tell = Callable[[str, str], None]
 """Called with the topic and the text of a note for the cell's keeper."""
 
@@ -43,8 +43,8 @@ Tell = Callable[[str, str], None]
 class TaughtStore:
     """Taught goals by name. ``model_of``: see `load_taught`.
 
-    A damaged file is set aside, told to ``recover``, and there are no goals; without ``recover`` it stays as it is, and
-    TaughtFileError is raised.
+    A damaged file is set aside and reported to ``recover``, and there are no goals; without ``recover`` it remains as
+    it is, and TaughtFileError is raised.
     """
 
     def __init__(self, path: Path, model_of: ModelOf = lambda _: None, recover: Tell | None = None) -> None:
@@ -63,17 +63,17 @@ class TaughtStore:
         return tuple(sorted(self.goals))
 
     def add(self, name: str, goal: TaughtGoal) -> None:
-        """Store a goal, replacing one of the same name. Raises OSError, and the goal is not there then."""
+        """Store a goal, replacing one of the same name. Raises OSError; the goal is then not stored."""
         self._replace({**self.goals, name: goal})
 
     def refine(self, used: CellModel, model: CellModel) -> None:
-        """State the goals in ``model`` in the place of ``used``, where nothing but the estimate changed (see
-        `refined_goal`). Raises OSError where they cannot be stored; they are restated in memory then.
+        """Restate the goals in ``model`` instead of ``used``, if only the estimate changed (see `refined_goal`). Raises
+        OSError if they cannot be stored; they are then restated in memory.
         """
         self.put_back({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
 
     def put_back(self, goals: dict[str, TaughtGoal]) -> None:
-        """Have ``goals`` in memory, and in the file where it holds others. Raises OSError."""
+        """Set ``goals`` in memory, and write the file if it holds others. Raises OSError."""
         self.goals = goals
         try:
             stored = load_taught(self._path)
@@ -108,18 +108,18 @@ class ModelStore:
         return sorted(int(match[1]) for path in self._directory.iterdir() if (match := pattern.fullmatch(path.name)))
 
     def next_epoch(self) -> int:
-        """The last epoch plus one; those of damaged files that were set aside count."""
+        """The last epoch plus one; epochs of damaged files that were set aside count."""
         return max(self._epochs(self._USED), default=0) + 1
 
     def of_epoch(self, epoch: int) -> CellModel | None:
-        """Model of an epoch, None where its file is missing or damaged."""
+        """Model of an epoch, None if its file is missing or damaged."""
         try:
             return load_model(self.path(epoch))
         except ModelFileError:
             return None
 
     def newest_fitting(self, settings: CoreSettings, *, recover: bool = False) -> tuple[CellModel | None, list[str]]:
-        """Newest model that fits the cell's joints and cameras, and why newer ones were skipped.
+        """Newest model that fits the cell's joints and cameras, and the reasons why newer ones were skipped.
 
         ``recover``: set damaged files aside. Models of another schema are not damaged.
         """
@@ -140,7 +140,7 @@ class ModelStore:
 
 
 def _mismatch(model: CellModel, settings: CoreSettings) -> str:
-    """Reason why ``model`` does not belong to this cell; empty where it does."""
+    """Reason why ``model`` does not belong to this cell; empty if it does."""
     if model.joint_names != settings.joint_names or model.joint_kinds != settings.joint_kinds:
         return f"is of joints {_joints(model)}; the cell has {_joints(settings)}"
     of_model = [(camera.name, camera.width, camera.height) for camera in model.cameras]
@@ -165,9 +165,9 @@ def _joints(of: CellModel | CoreSettings) -> str:
 
 
 class Journal:
-    """Log of events for people, one JSON object a line; the older half is dropped when the file has grown large.
+    """Log of events for people, one JSON object per line; the older half is dropped when the file has grown large.
 
-    What cannot be written is lost and counted (``note``).
+    Lines that cannot be written are lost and counted (``note``).
     """
 
     def __init__(self, path: Path, limit: int = JOURNAL_BYTES) -> None:
@@ -185,7 +185,7 @@ class Journal:
 
     @property
     def note(self) -> str:
-        """Text on lines that are missing; empty where there are none."""
+        """Text on lines that are missing; empty if there are none."""
         return f"{self._path}: {self._lost} events are missing in it: {self._cause}" if self._cause else ""
 
     def _open(self) -> FileIO:
@@ -225,14 +225,15 @@ class Journal:
 
 
 # -- what outlives a gateway ---------------------------------------------------------------------------------
-# What of a gateway outlives it: the goals that have not ended, so that each gets its one terminal event whoever is
-# killed meanwhile, and the numbers of the core's events that were dealt with: the next gateway is sent them all again.
+# State that survives a restart of the gateway: the goals that have not ended, so that each gets exactly one terminal
+# event even if a process is killed; and the numbers of the core's events that were handled, because the next gateway
+# receives them all again.
 
 
 _HANDLED_LAYOUT = "HandledEvents.1"
 _HANDLED = struct.Struct("=qq")
 AGAIN_S = 1.0
-"""How often goals that could not be written are tried again."""
+"""Interval of attempts to write goals that could not be written [s]."""
 BEGINS = frozenset({"goal_accepted", "goal_started", "calibration_progress"})
 ENDS = frozenset({*TERMINAL, "calibration_finished", "calibration_aborted", "check_finished"})
 
@@ -240,7 +241,7 @@ ENDS = frozenset({*TERMINAL, "calibration_finished", "calibration_aborted", "che
 class OpenGoalRecord:
     """Goals accepted and not ended, by the events that are published; ``boot`` is the daemon's run.
 
-    What a full disk has not taken is written once there is room: a goal that stayed in the file would end twice.
+    A write that failed on a full disk is repeated until it succeeds: a goal that remained in the file would end twice.
     """
 
     def __init__(self, directories: CellDirectories, boot: str) -> None:
@@ -250,7 +251,7 @@ class OpenGoalRecord:
         self._due_s: float | None = None
 
     def observe(self, event: EventMessage, *, repeated: bool = False) -> None:
-        """Take an event that was published; ``repeated``: by a gateway before this one, which may not have had room."""
+        """Handle an event that was published; ``repeated``: by an earlier gateway, which may have had a full disk."""
         if event.kind in BEGINS and event.id and event.id not in self._goals:
             calibration = event.kind.startswith("calibration")
             self._goals[event.id] = OpenGoal(event.id, self._boot, calibration)
@@ -262,7 +263,7 @@ class OpenGoalRecord:
             self._store()
 
     def poll(self) -> None:
-        """Write what is not written yet, each second."""
+        """Write pending changes, once a second."""
         if self._due_s is not None and time.monotonic() >= self._due_s:
             self._store()
 
@@ -270,7 +271,7 @@ class OpenGoalRecord:
         again, self._due_s = self._due_s is not None, None
         try:
             write_goals(self._directories, tuple(self._goals.values()))
-        except OSError as error:  # a full disk: goals go on, and end, all the same
+        except OSError as error:  # a full disk: goals continue, and end, nevertheless
             self._due_s = time.monotonic() + AGAIN_S
             if not again:
                 write_log("gateway", f"{self._directories.open_goals}: {error.strerror}")
@@ -299,10 +300,10 @@ class OpenGoalRecord:
 
 
 class HandledEvents:
-    """Up to which event the journal has them, and up to which those were acted upon that must not be twice.
+    """Number of the last event in the journal, and of the last one with a single effect that was acted on.
 
-    A slot, because a gateway that is killed while it writes a file leaves half of it. Where it is damaged, all events
-    of before this start are taken for handled. Raises SlotError.
+    Stored in a slot, because a gateway killed while writing a file leaves an incomplete one. If the slot is damaged,
+    all events before this start count as handled. Raises SlotError.
     """
 
     def __init__(self, path: Path, tell: Tell) -> None:
@@ -332,11 +333,11 @@ class HandledEvents:
         return event.seq <= self._acted or event.t_ns < self._not_before_ns
 
     def missed_before(self, event: Event) -> int:
-        """How many events are missing between those that were dealt with and ``event``."""
+        """Number of events missing between the last handled one and ``event``."""
         return 0 if event.t_ns < self._not_before_ns else max(0, event.seq - self._journaled - 1)
 
     def mark(self, event: Event, *, acted: bool) -> None:
-        """``event`` is in the journal and, with ``acted``, has had its effect."""
+        """Record that ``event`` is in the journal and, with ``acted``, has had its effect."""
         self._journaled = max(self._journaled, event.seq)
         if acted:
             self._acted = max(self._acted, event.seq)

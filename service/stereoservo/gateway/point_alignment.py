@@ -25,21 +25,23 @@ Deviations = dict[str, dict[int, float]]
 Fit = Callable[[BoolArray], tuple[FrameChange, FloatArray]]
 
 RESIDUAL_PX = 1.5
-"""Common markers that disagree by more than this, and by six deviations, have not moved as one."""
+"""Common markers that disagree by more than this, and by six standard deviations, have not moved rigidly."""
 SIGMA_PX = 2.0
-"""Set-points that are known no better than this are refused."""
+"""Set-points with at least this standard deviation [px] are refused."""
 DEVIATIONS = 6.0
 ALIKE = 3.0
-"""Times what the best explanation leaves, or the deviation of what is observed: explanations within it are as good."""
+"""Factor on the best explanation's residual, or on the standard deviation of the observations: explanations with
+smaller residuals count as equally good.
+"""
 MIN_MARKERS = 3
 
 
 class TransferError(Exception):
-    """A taught goal cannot be transferred, or a CAD goal not be located; the text has cause and values."""
+    """A taught goal cannot be transferred, or a CAD goal cannot be located; the text has cause and values."""
 
 
 def require_still(observations: MarkerObservations, markers: list[int], what: str) -> None:
-    """Raise TransferError naming those of ``markers`` that move."""
+    """Raise TransferError naming the ``markers`` that move."""
     moving = sorted({m for points in observations.values() for m in markers if m in points and points[m].moves})
     if moving:
         raise TransferError(f"{what} {listed(moving)} move now; send the goal when they stand still")
@@ -55,7 +57,7 @@ def align_points(
     common: list[int],
     what: str,
 ) -> tuple[FrameChange, str]:
-    """Map of points (n, 4) onto their observed markers; refused where they have not moved rigidly."""
+    """Map of points (n, 4) onto their observed markers; refused if they have not moved rigidly."""
 
     def fit(rows: BoolArray) -> tuple[FrameChange, FloatArray]:
         kept = np.flatnonzero(rows)
@@ -86,21 +88,21 @@ def align_points(
 
 
 def _allowed(now: MarkerViews) -> tuple[float, float]:
-    """Largest deviation of what is observed, and what a fit may leave [px]."""
+    """Largest standard deviation of the observations, and the largest accepted residual of a fit [px]."""
     sigma = float(now.sigmas[np.isfinite(now.sigmas)].max(initial=0.0))
     return sigma, max(RESIDUAL_PX, DEVIATIONS * sigma)
 
 
 def _outlier(fits: Iterable[tuple[str, Callable[[], FloatArray]]], sigma: float, limit: float, why: str) -> str:
-    """The single feature, by name, without which what its fit leaves [px] is below ``limit``, and ``why`` that may be;
-    those that explain it as well as the best; empty where there is none, or too few are left.
+    """Text naming the single feature without which the fit's residual [px] is below ``limit``, and its reason ``why``;
+    or all features that explain it as well as the best one. Empty if there is none, or too few features remain.
     """
     left: dict[str, float] = {}
     for name, fit in fits:
         try:
             left[name] = float(np.nanmax(fit(), initial=0.0))
         except GeometryError:
-            continue  # too few are left, or they are coplanar: this one cannot be tested
+            continue  # too few remain, or they are coplanar: this one cannot be tested
     best = min(left.values(), default=limit)
     alike = sorted((px, name) for name, px in left.items() if px < min(limit, max(ALIKE * best, ALIKE * sigma)))
     if not alike:
@@ -114,10 +116,11 @@ def _outlier(fits: Iterable[tuple[str, Callable[[], FloatArray]]], sigma: float,
 def reproject_set_points(
     model: CellModel, names: list[int], points: FloatArray, covariance: FloatArray, what: str
 ) -> tuple[Pixels, Deviations, str]:
-    """Raw set-points of points (n, 4) by camera and marker, their deviations [px], and a description of their
+    """Raw set-points of points (n, 4) by camera and marker, their standard deviations [px], and a description of their
     accuracy.
 
-    A point outside of an image is none there. Raises TransferError behind a camera, and where too few remain.
+    A point outside of an image yields no set-point there. Raises TransferError for a point behind a camera, and if too
+    few remain.
     """
     views = MarkerViews.empty(model, names)
     pixels, deviations = reprojected(views.Ps, points, covariance)
@@ -160,12 +163,15 @@ def listed(markers: Iterable[object]) -> str:
 # -- edges and faces --
 
 SEGMENT_PX = 0.5
-"""Of the ends of segments that a client states."""
+"""Standard deviation [px] of the ends of segments that a client states."""
 
 
 @dataclass(frozen=True)
 class CommonFeatures:
-    """What gives a workpiece's motion: ids of ``points``, ``lines`` by two ids each, ``planes`` by their points."""
+    """Features that determine a workpiece's motion.
+
+    ``points``: ids; ``lines``: two ids each; ``planes``: ids of their points.
+    """
 
     points: tuple[int, ...]
     lines: tuple[tuple[int, int], ...]
@@ -178,11 +184,11 @@ class CommonFeatures:
 
     @property
     def names(self) -> list[str]:
-        """What to call points and lines, in their order."""
+        """Names of points and lines, in their order."""
         return [f"point {marker}" for marker in self.points] + [f"edge {a}-{b}" for a, b in self.lines]
 
     def without(self, k: int) -> CommonFeatures:
-        """These without the k-th of `names`."""
+        """These features without the k-th of `names`."""
         n = len(self.points)
         points = self.points[:k] + self.points[k + 1 :] if k < n else self.points
         lines = self.lines if k < n else self.lines[: k - n] + self.lines[k - n + 1 :]
@@ -198,8 +204,8 @@ def align_features(
     observations: MarkerObservations,
     model: CellModel,
 ) -> tuple[FrameChange, str]:
-    """Map of the workpiece since the goal was taught, by the lines, planes and points that are asked for, and a
-    sentence on its evidence. Raises TransferError.
+    """Map of the workpiece since the goal was taught, by the requested lines, planes and points, and a sentence on its
+    evidence. Raises TransferError.
     """
     features = CommonFeatures(requested.common, requested.lines, requested.planes)
     what = f"relative to the {requested.relative_to}"
@@ -240,7 +246,7 @@ def align_features(
 
 
 def fixed_line(feature: Feature, model: CellModel) -> Feature:
-    """A line that is given by segments of its images, by two points in the model's frame. Raises TransferError."""
+    """A line given by segments in its images, as two points in the model's frame. Raises TransferError."""
     views = MarkerViews.empty(model, (0, 1))
     for camera, ends in feature.segments.items():
         views.add(camera, {k: (pixel, SEGMENT_PX) for k, pixel in enumerate(ends)})
@@ -272,7 +278,7 @@ def _mixed(views: MarkerViews, features: CommonFeatures) -> MixedFeatures:
 
 
 def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> None:
-    """Raise TransferError for points and edges that fewer than two cameras see, and planes of too few points."""
+    """Raise TransferError for points and edges seen by fewer than two cameras, and planes of too few points."""
     seen: BoolArray = np.asarray(np.isfinite(views.pixels).all(axis=2))
 
     def cameras(ids: Iterable[int]) -> list[str]:

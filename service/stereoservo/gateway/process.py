@@ -1,6 +1,6 @@
-"""The gateway process: connects zenoh clients with the servo process, and keeps models, taught goals and recordings.
+"""The gateway process: connects zenoh clients with the servo process, and stores models, taught goals and recordings.
 
-Nothing that the arm waits for runs here; its silence means hold. ``python -m stereoservo.gateway.process
+The arm waits for nothing here; if the gateway is silent, the arm holds. ``python -m stereoservo.gateway.process
 RUNTIME_DIRECTORY PARENT_PID``.
 """
 
@@ -96,27 +96,27 @@ from stereoservo.ports.devices import CameraDescription
 
 STATE_EVERY_S = 0.05
 STEPS_EVERY_S = 0.05
-"""How often step records are taken: their ring has room for seconds of them, and a batch costs less than each alone."""
+"""Interval of reading step records [s]: their ring holds several seconds, and a batch costs less than single reads."""
 IDLE_S = 0.003
-"""Between passes without news."""
+"""Sleep between passes without news [s]."""
 REST_S = 0.006
-"""The same where no client and no event has come for ``REST_AFTER_S``; a stop has a thread of its own."""
+"""The same if no client and no event has been active for ``REST_AFTER_S``; a stop has its own thread."""
 REST_AFTER_S = 1.0
 FINAL_PASSES = 100
 LAST_EVENTS_S = 3.0
-"""A servo process whose supervisor was killed brings the arm to rest before it ends: its last events are waited for."""
+"""Time to wait for the last events of a servo process whose supervisor was killed: it stops the arm before it ends."""
 DRAIN = 32
 ANNOUNCE_AGAIN_S = 1.0
 EXIT_SETUP = 3
 ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted", "fault"})
-"""Events of the core whose effects must not come twice."""
+"""Events of the core whose effects must not happen twice."""
 SUPERVISOR_SILENT = (
     f"the supervisor has given no sign of life for {SUPERVISOR_HANG_S:g} s: it hangs or was stopped (Ctrl-Z, SIGSTOP). "
     "The arm and every stop work as before, but a process that hangs is not killed and one that ends is not started "
     "again: let it go on (`kill -CONT` its process), or stop the arm, end the daemon and run the cell again"
 )
 GATEWAY_VERBS = ("record", "synthesise", "restore")
-"""Commands that the gateway carries out itself."""
+"""Commands that the gateway executes itself."""
 
 
 class Gateway:
@@ -251,11 +251,11 @@ class Gateway:
             self._calibration.load(self._state.newest.status.model_epoch)
             self._refinement.complete_hand_over()
         events = self._servo.events()
-        if events:  # who hears of one finds no older state
+        if events:  # a client that receives an event finds no older state
             self._read_state()
         for event in events:
             self._core_event(event)
-        self._intake.expire()  # after the answers that came while this process had no time
+        self._intake.expire()  # after the answers that arrived while this process was suspended
         busy = self._queries() or bool(events)
         self._publish_features()
         with self._preview_boundary:
@@ -278,7 +278,7 @@ class Gateway:
         self._steps_taken = time.monotonic()
         for item in self._servo.steps(limit):
             self._recordings.take(item)
-        if self._recordings.refused:  # the next request to record begins anew
+        if self._recordings.refused:  # the next request to record starts a new one
             self._recordings.refused = False
             self._servo.records = self._recordings.wants_steps
 
@@ -298,7 +298,7 @@ class Gateway:
         return busy
 
     def _answer_wrong_key(self, query: Any) -> None:
-        """Refuse ``query``, naming the commands there are, where its key is of none; others answer the rest."""
+        """Refuse ``query`` with the list of commands if its key matches none; else the matching command replies."""
         asked = str(query.key_expr)
         if "*" in asked or asked == self.keys.stop or self.keys.is_command(asked):
             query.drop()
@@ -306,9 +306,7 @@ class Gateway:
             self._answer(query, self._gateway_command)
 
     def _answer(self, query: Any, work: Callable[[Any], bytes], key: str = "") -> None:
-        """Reply to ``query`` with the result of ``work``, on ``key`` (default: the query's own, where it is
-        concrete).
-        """
+        """Reply to ``query`` with the result of ``work``, on ``key`` (default: the query's own key, if concrete)."""
         asked = str(query.key_expr)
         if not key and "*" in asked:
             query.drop()
@@ -335,7 +333,7 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._take_steps()  # those until now belong to what was recorded so far
+        self._take_steps()  # earlier ones belong to the recording so far
         if not request.on:
             text = self._recordings.stop()
             self._servo.records = self._recordings.wants_steps
@@ -395,7 +393,7 @@ class Gateway:
             self._handled.mark(event, acted=False)
             return
         self._intake.core_event(event)
-        # A restarted gateway is sent the servo process's events again.
+        # A restarted gateway receives the servo process's events again.
         fresh = not self._handled.is_acted_on(event)
         self._repeated = self._handled.is_journaled(event)
         operator = self._stop.stopped_by(event.t_ns) if event.kind == "stopped" else ""
@@ -432,7 +430,7 @@ class Gateway:
             self._refinement.take_state(state.status)
 
     def _newest_message(self) -> StateMessage | None:
-        """The state as of now; None before the first."""
+        """The current state; None before the first one."""
         self._read_state()
         self._collect_notes()
         return self._state.message(
@@ -443,7 +441,7 @@ class Gateway:
         )
 
     def _collect_notes(self) -> None:
-        """Bring the notes on what was left out up to date."""
+        """Update the notes on omitted messages and lines."""
         self._notes.tell("journal", self._journal.note)
         self._notes.tell("servo process", self._servo.note)
         self._notes.tell("reports", self._reports.note)
@@ -501,8 +499,8 @@ class Gateway:
         self._refinement.cancel()
         self._take_steps(100_000)
         self._recordings.close()
-        with suppress(zenoh.ZError):  # telling is good manners, not needed
-            if not self._servo.connected:  # else the next gateway goes on
+        with suppress(zenoh.ZError):  # this message is a courtesy, not required
+            if not self._servo.connected:  # otherwise the next gateway continues
                 self.goals.end_current(self.log)
             self.log.add("daemon_ends", message="the daemon ends", origin="gateway")
         self._replies.close()
@@ -535,7 +533,7 @@ class Gateway:
 
     @property
     def owed(self) -> bool:
-        """Whether the servo process, which ends as well, has yet to tell how a goal ended."""
+        """Whether the servo process, which ends as well, must still report how a goal ended."""
         return self._servo.connected and self.goals.any_of_this_run
 
 
@@ -576,8 +574,8 @@ def main() -> int:
 
 
 # -- the state of the cell -----------------------------------------------------------------------------------
-# The state of the cell as the gateway publishes it: the servo process's own, with what that cannot know, which is
-# whether it lives itself, why a camera is silent, and who stopped the arm.
+# The state of the cell as published: the servo process's own state, completed by what the gateway adds: whether the
+# servo process is alive, why a camera is silent, and who stopped the arm.
 
 
 SERVO_STALE_S = 0.5
@@ -585,7 +583,7 @@ CAMERA_SILENT = "CAMERA_SILENT"
 
 
 class CellState:
-    """The newest state of a cell, and the message of it. Raises SlotError."""
+    """The newest state of a cell, and its message. Raises SlotError."""
 
     def __init__(self, plan: RunPlan, boot: str, servo: ServoConnection) -> None:
         self._plan = plan
@@ -605,12 +603,14 @@ class CellState:
         return state
 
     def take_event(self, event: Event, operator: str, *, repeated: bool) -> None:
-        """Note who halts the arm. ``operator``: of a stop, where known; ``repeated``: told to an earlier gateway."""
+        """Record who stops or holds the arm. ``operator``: sender of a stop, if known; ``repeated``: sent to an earlier
+        gateway, too.
+        """
         self._halt.take(event, operator, repeated=repeated)
 
     def message(self, **told: Any) -> StateMessage | None:
-        """The state in the clients' format at this moment, with what is ``told`` to `state_message` beside it; None
-        before the first.
+        """The current state in the clients' format, with the further arguments ``told`` of `state_message`; None before
+        the first state.
         """
         if self.newest is None:
             return None
@@ -619,7 +619,7 @@ class CellState:
         state = state_message(
             self._plan, self._boot, self.newest, now_ns=time.monotonic_ns(), servo_alive=alive, **told
         )
-        silent = self._cameras.reasons(state) if heard else ()  # a silent servo process takes no frames
+        silent = self._cameras.reasons(state) if heard else ()  # a silent servo process receives no frames
         halted = any(reason.code in ("STOPPED", "HELD") for reason in state.reasons)
         return msgspec.structs.replace(
             state,
@@ -634,7 +634,7 @@ class CellState:
 
 
 class _Halts:
-    """Who has stopped or held the arm, by the core's events."""
+    """Operator who stopped or held the arm, from the core's events."""
 
     def __init__(self) -> None:
         self.now: Halt | None = None
@@ -663,7 +663,9 @@ def _stop_words(event: Event, operator: str, repeated: bool) -> str:
 
 
 class CameraWatch:
-    """Finds the cameras that deliver no frames, and why, by the heartbeats of their processes. Raises SlotError."""
+    """Finds the cameras that deliver no frames, and the reasons, from the heartbeats of their processes. Raises
+    SlotError.
+    """
 
     def __init__(self, directories: CellDirectories, cameras: Sequence[CameraDescription]) -> None:
         self._cameras = {
@@ -692,7 +694,7 @@ class CameraWatch:
 
 
 def _why_silent(heartbeat: HeartbeatReader, lives: bool, age_s: float | None) -> tuple[Level, str]:
-    """Level and hint of the reason of a camera whose newest frame has this age [s]; None: there was none."""
+    """Level and hint of the reason for a camera whose newest frame has this age [s]; None: no frame so far."""
     beat = heartbeat.newest()
     if not lives:
         if beat is None:
@@ -719,4 +721,4 @@ if __name__ == "__main__":
     code = main()
     sys.stdout.flush()
     sys.stderr.flush()
-    os._exit(code)  # a hung client may still hold a zenoh thread
+    os._exit(code)  # a hung client may still block a zenoh thread

@@ -44,7 +44,7 @@ from stereoservo.messages.wire import (
 from stereoservo.ports.devices import CameraObservation
 
 KEPT_EVENTS = 2_000
-"""Asked for by a client that was away. Each as its bytes: a tenth of what its objects take."""
+"""Number of stored events, for clients that reconnect. Each is stored as bytes: a tenth of the size of objects."""
 EVENTS_A_REPLY = 300
 PREVIEW_ASK_S = 0.25
 SILENT = frozenset({"reply"})
@@ -61,8 +61,8 @@ class ReplyThread:
         self._thread.start()
 
     def reply(self, query: Any, payload: bytes, key: str = "") -> None:
-        """Queue a reply to ``query`` on ``key`` (default: the query's own, which must then be concrete) and drop
-        the query.
+        """Queue a reply to ``query`` on ``key`` (default: the query's own, which must then be concrete) and drop the
+        query.
         """
         self._queue.put((query, key or str(query.key_expr), payload))
 
@@ -72,17 +72,17 @@ class ReplyThread:
             try:
                 with query:
                     query.reply(key, payload, encoding=ENCODING)
-            except Exception as error:  # one query that takes no reply must not leave the others without
+            except Exception as error:  # a query that fails to accept its reply must not block the others
                 self._unsent.add(f"a reply on {key!r} could not be sent: {type(error).__name__}: {error}")
 
     def close(self) -> None:
-        """Send queued replies for a second at most, and end."""
+        """Send queued replies for at most one second, and end."""
         self._queue.put(None)
         self._thread.join(1.0)
 
 
 class EventLog:
-    """Numbers the events of a boot, keeps the last ones, publishes each, and then has it observed."""
+    """Numbers the events of a boot, stores the last ones, publishes each, and then passes it to the observer."""
 
     def __init__(
         self,
@@ -108,7 +108,7 @@ class EventLog:
             kind=kind,
             **fields,
         )
-        encoded = encode(message)  # a number that is not finite raises here, and is no event
+        encoded = encode(message)  # a number that is not finite raises here; the event is not published
         self.last = message.seq
         self._kept.append(encoded)
         self._publish(encoded)
@@ -130,7 +130,7 @@ class EventLog:
 
 
 def core_event_fields(event: Event) -> dict[str, Any]:
-    """What of a core's event clients are told, beside its kind and time."""
+    """Fields of a core's event that are published to clients, besides its kind and time."""
     return {
         "message": event.message,
         "id": event.id,
@@ -144,8 +144,9 @@ def core_event_fields(event: Event) -> dict[str, Any]:
 
 
 class KeeperNotes:
-    """Notes for the cell's keeper, one a topic, shown in the state; a new one is also reported by one event.
-    ``standing``: those of the whole run.
+    """Notes for the cell's keeper, one per topic, shown in the state; a new one is also reported by one event.
+
+    ``standing``: notes of the whole run.
     """
 
     def __init__(self, log: EventLog, standing: tuple[str, ...] = ()) -> None:
@@ -171,7 +172,7 @@ class KeeperNotes:
 
 
 def features_message(observation: CameraObservation, shift_ns: int | None = None) -> FeaturesMessage:
-    """An observation in the clients' format; ``shift_ns``: wall clock less its clock (None: this host's, as of now).
+    """An observation in the clients' format; ``shift_ns``: wall clock minus its clock (None: this host's current one).
 
     Raises MessageError for numbers that are not finite.
     """
@@ -193,7 +194,7 @@ def features_message(observation: CameraObservation, shift_ns: int | None = None
 
 
 class Previews:
-    """Publishes pictures of the cameras, and asks for them only while somebody subscribes."""
+    """Publishes pictures of the cameras, and requests them only while somebody subscribes."""
 
     def __init__(self, publishers: dict[str, Any], directories: CellDirectories) -> None:
         self._publishers = publishers
@@ -202,7 +203,7 @@ class Previews:
         self._asked = 0.0
 
     def poll(self) -> None:
-        """Publish the pictures that are there. Raises what a decoder raises."""
+        """Publish the available pictures. Raises the exceptions of a decoder."""
         now = time.monotonic()
         if now - self._asked > PREVIEW_ASK_S:
             self._asked = now
@@ -223,7 +224,7 @@ class Previews:
 
 
 def preview_info(picture: PreviewPicture) -> PreviewInfo:
-    """What a picture shows, in the clients' format."""
+    """Content of a picture, in the clients' format."""
     age_s = (time.monotonic_ns() - picture.t_shutter_ns) * 1e-9
     return PreviewInfo(
         picture.camera, picture.seq, picture.t_shutter_ns, time.time() - age_s, picture.width, picture.height
@@ -231,7 +232,7 @@ def preview_info(picture: PreviewPicture) -> PreviewInfo:
 
 
 class Publishers:
-    """The zenoh publishers, one a key."""
+    """The zenoh publishers, one per key."""
 
     def __init__(self, session: Any, keys: KeySpace, cameras: tuple[str, ...]) -> None:
         drop = zenoh.CongestionControl.DROP
@@ -266,7 +267,7 @@ def cell_info(
     recording: str,
     plan: RunPlan | None,
 ) -> CellInfo:
-    """Description of the cell: joints, cameras, laws, model, taught goals; and of its run, with a ``plan``."""
+    """Description of the cell (joints, cameras, laws, model, taught goals) and of its run, with a ``plan``."""
     limits = settings.limits
     return CellInfo(
         cell=settings.cell,

@@ -24,7 +24,7 @@ from stereoservo.recording.ring import RingLimits, RingThread
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
 LAST_WORD_S = 5.0
-"""How long vision processes have to finish their files before the gateway reports that they did not."""
+"""Time limit for vision processes to finish their files [s]; then the gateway reports that they did not."""
 
 
 class CannotRecordError(Exception):
@@ -42,7 +42,7 @@ class ImageRecordings:
         self._directory = ""
         self._until: float | None = None
         self._told: dict[str, RecordedImages] = {}
-        self._path.unlink(missing_ok=True)  # of a gateway before this one: its recording has ended
+        self._path.unlink(missing_ok=True)  # of an earlier gateway: its recording has ended
 
     @property
     def running(self) -> bool:
@@ -50,7 +50,7 @@ class ImageRecordings:
         return bool(self._directory) and self._until is None
 
     def check(self) -> None:
-        """Raise CannotRecordError where no camera of the cell delivers images."""
+        """Raise CannotRecordError if no camera of the cell delivers images."""
         if not self._cameras:
             names = ", ".join(self._others)
             raise CannotRecordError(
@@ -59,9 +59,9 @@ class ImageRecordings:
             )
 
     def begin(self, recording: Path) -> None:
-        """Request all cameras to record beside ``recording``."""
+        """Request all cameras to record along with ``recording``."""
         if self._until is not None:
-            self._until = 0.0  # the recording before has had its time
+            self._until = 0.0  # the time limit of the previous recording has passed
             self.poll()
         directory = images_directory(recording)
         try:
@@ -80,7 +80,7 @@ class ImageRecordings:
         )
 
     def end(self) -> None:
-        """Request them to stop. Idempotent."""
+        """Request the cameras to stop recording. Idempotent."""
         if self.running:
             self._path.unlink(missing_ok=True)
             self._until = time.monotonic() + LAST_WORD_S
@@ -128,7 +128,8 @@ class ImageRecordings:
 class Recordings:
     """The flight ring, and the current recording on request, if any. ``path``: its file, or that of the last one.
 
-    A file that cannot be written ends early or never begins (``refused``): events and notes by ``tell`` have the cause.
+    A file that cannot be written ends early or is never started (``refused``); events and notes by ``tell`` have the
+    cause.
     """
 
     def __init__(self, plan: RunPlan, log: EventLog, tell: Tell) -> None:
@@ -162,16 +163,16 @@ class Recordings:
         return self._requested or self._ring is not None
 
     def request(self) -> None:
-        """Record into a file of its own from the next stream of steps on."""
+        """Record into a separate file from the next stream of steps on."""
         self._requested = True
 
     def keep_ring(self, t_ns: int) -> None:
-        """Keep the ring aside, for a fault at ``t_ns``."""
+        """Save the ring, for a fault at ``t_ns``."""
         if self._ring is not None:
             self._ring.keep(t_ns)
 
     def poll(self) -> None:
-        """Report what the ring has to say, with a note while it is not written; the state of image recordings."""
+        """Publish the ring's reports, with a note while it is not written, and the state of image recordings."""
         if self._ring is not None:
             while self._ring.said:
                 kind, message = self._ring.said.popleft()
@@ -191,14 +192,14 @@ class Recordings:
         self.poll()
 
     def want_images(self) -> None:
-        """Also record images: now, or with the recording that is about to begin. Raises CannotRecordError."""
+        """Also record images: now, or with the recording that is about to start. Raises CannotRecordError."""
         self.images.check()
         self._with_images = True
         if self._recorder is not None and self.running and not self.images.running:
             self.images.begin(self._recorder.path)
 
     def take(self, item: StepMessage) -> None:
-        """Write messages of the servo process; the first one begins a file, where one is requested."""
+        """Write messages of the servo process; the first one starts a file, if one is requested."""
         if self._ring is not None:
             self._ring.take(item)
         if isinstance(item, RecordingStart) and self._requested:
@@ -233,7 +234,7 @@ class Recordings:
         self._tell("recording", text)
 
     def _new_path(self) -> Path:
-        """The requested file; another name where it exists (a restarted gateway continues in a new file)."""
+        """The requested file; another name if it exists (a restarted gateway continues in a new file)."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
         wanted = Path(self._plan.record) if self._plan.record not in ("", "auto") else None
         if wanted is not None:
@@ -241,7 +242,7 @@ class Recordings:
         return self._plan.directories.recordings / f"{self._plan.cell.cell.name}-{stamp}.mcap"
 
     def stop(self) -> str:
-        """Finish the file and the image recordings; returns what is in it. Idempotent."""
+        """Finish the file and the image recordings; returns the content's statistics. Idempotent."""
         self._requested = self._with_images = False
         self.refused = False
         self.images.end()
@@ -255,7 +256,7 @@ class Recordings:
 
 
 def _summary(recorder: FlightRecorder) -> str:
-    """Steps of a recording, and why there are no more of them."""
+    """Steps of a recording, and the reason why it ended early."""
     text = f"{recorder.path}: {recorder.steps} steps"
     if recorder.failure:
         text += f", {recorder.dropped} left out: {recorder.failure}"

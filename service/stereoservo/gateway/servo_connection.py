@@ -52,12 +52,12 @@ class ServoConnection:
         self._last_beat = 0.0
         self._last_try = 0.0
         self._last_event = 0
-        # A restarted gateway is sent old replies again: numbers must not meet those of its predecessor.
+        # A restarted gateway receives old replies again: its numbers must differ from those of its predecessor.
         self._next_request = time.monotonic_ns() // 1000
 
     @property
     def note(self) -> str:
-        """Text on messages that could not be read; empty where there were none."""
+        """Text on messages that could not be read; empty if there were none."""
         return self._boundary.note
 
     @property
@@ -66,7 +66,7 @@ class ServoConnection:
         return self._control is not None and self._control.is_open
 
     def poll_connection(self) -> None:
-        """Connect where needed, and send a heartbeat when one is due."""
+        """Connect if needed, and send a heartbeat when one is due."""
         now = time.monotonic()
         if now - self._last_try >= RECONNECT_EVERY_S:
             self._last_try = now
@@ -75,7 +75,7 @@ class ServoConnection:
                 if self._control is not None:
                     self._control.send(encode(Received(self._last_event)))
             if self._steps is None:
-                with suppress(SlotError):  # not there yet; tried again
+                with suppress(SlotError):  # not available yet; tried again
                     self._steps = RingReader(self._directories.steps_ring)
         if self._steps is not None and self._steps.reading != self.records:
             (self._steps.attach if self.records else self._steps.detach)()
@@ -84,12 +84,12 @@ class ServoConnection:
             self._control.send(encode(Heartbeat()))
 
     def restart_steps(self) -> None:
-        """Begin the stream of step records anew, with a checkpoint, for a recording that begins now."""
+        """Restart the stream of step records with a checkpoint, for a recording that starts now."""
         if self._steps is not None:
             self._steps.attach()
 
     def send_command(self, command: Command, operator: str) -> int | None:
-        """Send a command; returns its request number, None where the servo process is not connected."""
+        """Send a command; returns its request number, None if the servo process is not connected."""
         number = self._next_request
         self._next_request += 1
         if self._control is None or not self._control.send(encode(Ask(Request(number, operator, command)))):
@@ -97,9 +97,9 @@ class ServoConnection:
         return number
 
     def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
-        """Send a model to the core, with the coplanar groups of its markers: the loop has no time to look for them.
+        """Send a model to the core, with the coplanar groups of its markers, which the loop has no time to compute.
 
-        Without its covariance, which the loop does not use: messages are bounded.
+        The covariance, which the loop does not use, is omitted: messages have a maximum size.
         """
         bare = with_groups(msgspec.structs.replace(model, covariance=None))
         return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
@@ -138,7 +138,7 @@ class ServoConnection:
         return None
 
     def announced_silence(self) -> bool:
-        """Whether the servo process writes no state because it configures drives, as it has announced."""
+        """Whether the servo process has announced that it writes no state while it configures drives."""
         beat = self._heartbeat.newest()
         return beat is not None and beat.limit_s > SERVO_HANG_S and not beat.silent_s(SERVO_HANG_S)
 
@@ -155,5 +155,5 @@ class ServoConnection:
 def _try(directories: CellDirectories, name: str) -> PacketChannel | None:
     try:
         return PacketChannel.connect(getattr(directories, name))
-    except ChannelError:  # not up (yet); tried again
+    except ChannelError:  # not available (yet); tried again
         return None

@@ -1,5 +1,5 @@
-"""Registry of a cell's taught goals: stores them with their model, makes goals from CAD drawings, and resolves goals
-to set-points for the current model.
+"""Registry of a cell's taught goals: stores them with their model, makes goals from CAD drawings, and resolves goals to
+set-points for the current model.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class TaughtGoalRegistry:
                 self._tools.popitem(last=False)
 
     def taught(self, event: Event) -> bool:
-        """Store the goal of a ``taught`` event; returns whether that was possible. A warning has the reason if not."""
+        """Store the goal of a ``taught`` event; returns whether that succeeded. If not, a warning has the reason."""
         model = self._model()
         tool = self._tools.pop(event.request, ())
         if model is None:
@@ -99,16 +99,16 @@ class TaughtGoalRegistry:
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
 
     def seen_when_taught(self, target: TaughtTarget, markers: tuple[MarkerId, ...]) -> dict[str, dict[int, Pixel]]:
-        """Raw pixels of those of the ``markers`` that are not on the body, by camera, when it was taught. Raises
-        KeyError.
+        """Raw pixels, by camera, of the ``markers`` that are not on the body, as stored when the goal was taught.
+        Raises KeyError.
         """
         return _where(markers, self._store.goals[target.name].others)
 
     def resolve_incidence(
         self, target: IncidenceTarget, follow: tuple[MarkerId, ...] = ()
     ) -> tuple[IncidenceTarget, dict[str, dict[int, Pixel]]]:
-        """Incidences with markers of the scene replaced by their current pixels, and lines by segments by points in
-        the model's frame; and, where markers were, where those to ``follow`` are in these pictures (raw pixels by
+        """Incidences with markers of the scene replaced by their current pixels, and lines given by segments replaced
+        by points in the model's frame; and, for replaced markers, the current pixels of those to ``follow`` (raw, by
         camera). Raises TransferError.
         """
         observations, epoch, incidences = self._seen(), target.model_epoch, []
@@ -155,7 +155,7 @@ class TaughtGoalRegistry:
 
 
 def _where(markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]) -> dict[str, dict[int, Pixel]]:
-    """Those of the ``markers`` that are ``shown``, by camera and marker; cameras that show none are not in it."""
+    """The ``markers`` that are ``shown``, by camera and marker; cameras that show none are left out."""
     found = {
         camera: {marker: pixels[marker] for marker in markers if marker in pixels} for camera, pixels in shown.items()
     }
@@ -163,7 +163,7 @@ def _where(markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel
 
 
 def _scene_feature(feature: Feature, observations: MarkerObservations, may_move: bool) -> Feature:
-    """Feature spanned by markers that are not on the body, by their current observations in two or more cameras."""
+    """Feature spanned by markers that are not on the body, from their current observations in two or more cameras."""
     pixels = {
         camera: tuple(seen[marker].pixel for marker in feature.markers)
         for camera, seen in observations.items()
@@ -197,7 +197,7 @@ def synthesise(
 ) -> tuple[TaughtGoal, str]:
     """Goal from drawn points and the pose of the tool on the workpiece, and a description of its accuracy.
 
-    The markers that the arm does not move are seen now; they place the drawing. Raises TransferError.
+    The markers that the arm does not move must be visible now; they locate the drawing. Raises TransferError.
     """
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
@@ -207,7 +207,7 @@ def synthesise(
         drawn_points(np.zeros((1, 3)), pose)
     except GeometryError as error:
         raise TransferError(f"pose: {error}") from error
-    if model.mount == "eye_in_hand":  # here the workpiece carries the model's body, the tool rides with the cameras
+    if model.mount == "eye_in_hand":  # here the workpiece carries the model's body, and the tool moves with the cameras
         fixed, moving, pose = moving, fixed, np.linalg.inv(pose)
     shared = sorted(set(fixed) & set(model.marker_ids))
     if shared:
@@ -251,7 +251,7 @@ def _drawn_goal(
     static_markers: list[int],
     created: str,
 ) -> TaughtGoal:
-    """Goal with the set-points of drawn markers as if they had been taught, and the markers that located them."""
+    """Goal with the set-points of drawn markers, in the form of a taught one, and the markers that located them."""
     of_body = {c: {m: p for m, p in seen.items() if m in model.marker_ids} for c, seen in set_points.items()}
     others = {c: {m: p for m, p in seen.items() if m not in model.marker_ids} for c, seen in set_points.items()}
     for camera, seen in observations.items():

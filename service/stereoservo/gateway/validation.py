@@ -1,7 +1,7 @@
-"""Validation of clients' goals and commands as far as it does not depend on the state of the arm: names, markers,
-joint limits, points, displacements, options; gives all problems of a message.
+"""Validation of clients' goals and commands as far as it does not depend on the state of the arm: names, markers, joint
+limits, points, displacements, options; returns all problems of a message.
 
-Each problem names the field, its value and what would have been valid; all of them are reported at once.
+Each problem names the field, its value and the valid values; all of them are reported at once.
 """
 
 from __future__ import annotations
@@ -269,18 +269,18 @@ POINTS_OF = {"point": 1, "line": 2, "plane": 3}
 SINGULAR = 1e-12
 """Least singular value of a displacement relative to its largest."""
 STRAIGHT = 1e-9
-"""Third singular value of points on one line, as unit vectors."""
+"""Largest third singular value of points on one line, as unit vectors."""
 
 
 MAX_SIZE = 1e100
-"""Of the largest number of what is homogeneous; its inverse is the smallest."""
+"""Limit of the largest component of homogeneous quantities; its inverse is the smallest."""
 
 
 @dataclass(frozen=True)
 class GoalContext:
     """Context of the checks: settings, names of taught goals, known markers.
 
-    ``model_markers``: of the model in use, None where there is none.
+    ``model_markers``: markers of the model in use, None if there is none.
     """
 
     settings: CoreSettings
@@ -349,7 +349,7 @@ def _inside(where: str, pixel: tuple[float, float], camera: CameraSettings) -> l
 
 
 def check_markers(where: str, markers: Sequence[int], context: GoalContext, *, body: bool) -> list[str]:
-    """Problems of marker ids: repeated, unknown to all detectors, or (``body``) not in the model, else in it."""
+    """Problems of marker ids: repeated, unknown to all detectors, not in the model (``body``) or in it (otherwise)."""
     problems = []
     known = context.settings.marker_ids
     for marker in dict.fromkeys(markers):
@@ -376,7 +376,7 @@ def check_homogeneous(where: str, point: Sequence[float]) -> list[str]:
 
 
 def _check_size(where: str, numbers: Sequence[float]) -> list[str]:
-    """Problems of numbers whose ratios alone count: the norm would overflow, or be zero."""
+    """Problems of numbers of which only the ratios count: the norm would overflow, or be zero."""
     largest = max(abs(number) for number in numbers)
     if 1.0 / MAX_SIZE <= largest <= MAX_SIZE:
         return []
@@ -504,7 +504,7 @@ def _check_feature(where: str, feature: Feature, kind: str, has_epoch: bool, con
     if count != need:
         problems.append(f"{where}.{given[0]}: {count} given; a {kind} is spanned by {need}")
     if feature.markers:
-        # A fixed feature's markers stand on the workpiece; the gateway puts their pixels in their place.
+        # A fixed feature's markers are on the workpiece; the gateway replaces them by their pixels.
         problems += check_markers(f"{where}.markers", feature.markers, context, body=where.endswith("moving"))
         return problems
     if not has_epoch:

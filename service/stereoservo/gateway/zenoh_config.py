@@ -18,13 +18,15 @@ _NETWORK_ENDPOINT = re.compile(r"(?P<protocol>tcp|tls)/(?P<host>\[[0-9A-Fa-f:.]+
 RECONNECT = {"period_init_ms": 100, "period_max_ms": 500}
 
 RUNTIME = "(net: (worker_threads: 4))"
-"""zenoh's threads for what is being connected, one unless given: strangers who connect by TCP again and again hold it,
-and no client of this host gets in meanwhile.
+"""Number of zenoh's threads that accept connections (default: one). With one, strangers who repeatedly connect by TCP
+occupy it, and no client of this host can connect.
 """
 
 
 def prepare_runtime() -> None:
-    """Give this process's zenoh its threads, before the first session; what the environment says stays."""
+    """Set the number of threads of this process's zenoh, before the first session; environment variables take
+    precedence.
+    """
     os.environ.setdefault("ZENOH_RUNTIME", RUNTIME)
 
 
@@ -38,8 +40,8 @@ def endpoint_of(cell: CellFile, socket: Path) -> str:
 def gateway_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
     """The gateway's main session: the router itself, or a client of a site's router.
 
-    A router listens on the unix socket in any case: the gateway's own second session and this host's clients use it.
-    Raises SessionError: an endpoint reaches beyond this host without TLS on both sides.
+    A router always listens on the unix socket as well, which the gateway's second session and this host's clients use.
+    Raises SessionError if an endpoint reaches beyond this host without TLS on both sides.
     """
     section = cell.zenoh
     for endpoint in section.endpoints:
@@ -66,11 +68,11 @@ def gateway_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, An
 
 
 def split_listeners(config: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """The gateway's main session, and the router that listens for it on other endpoints than the cell's own socket,
-    None where there are no others or the session is a client.
+    """The gateway's main session, and the router that listens for it on endpoints other than the cell's own socket;
+    None if there are no others or the session is a client.
 
-    The limits of a zenoh router (sessions, sockets that are being accepted) are common to all its endpoints. So
-    strangers on the network, however many, can lock out nobody but others on the network.
+    The limits of a zenoh router (sessions, sockets that are being accepted) are common to all its endpoints. With a
+    separate router, strangers on the network, however many, can block only other clients on the network.
     """
     own, others = config["listen"]["endpoints"][:1], config["listen"]["endpoints"][1:]
     if not others:
@@ -90,8 +92,8 @@ def stop_config(cell: CellFile, cell_dir: Path, socket: Path) -> dict[str, Any]:
 def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
     """Check an endpoint that the daemon listens on or connects to: beyond this host, both sides need a certificate.
 
-    Parameters of zenoh behind the address (``?…``, ``#…``) are refused: they override the session's TLS options.
-    Raises SessionError.
+    Zenoh parameters after the address (``?…``, ``#…``) are refused: they override the session's TLS options. Raises
+    SessionError.
     """
     if endpoint.startswith("unixsock-stream/") and not set(endpoint) & set("?#"):
         return
@@ -118,7 +120,7 @@ def check_endpoint(endpoint: str, tls: TlsSection | None) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether ``host`` is certainly this host: ``localhost``, 127.0.0.0/8 or [::1]. Other names are not looked up."""
+    """Whether ``host`` is certainly this host: ``localhost``, 127.0.0.0/8 or [::1]. Other names are not resolved."""
     if host.startswith("["):
         return host == "[::1]"
     try:

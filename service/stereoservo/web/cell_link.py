@@ -1,5 +1,5 @@
-"""The page server's link to the daemon, a goal client: a thread that reads what the cell publishes, and the commands
-that pages give.
+"""The page server's link to the daemon, a goal client: a thread that receives what the cell publishes, and the commands
+of pages.
 """
 
 from __future__ import annotations
@@ -31,25 +31,26 @@ from stereoservo.web.rights import LEASE_S, Leases
 
 POLL_S = 0.004
 AGAIN_S = 0.25
-"""Before another session is tried; well within `LEASE_S`, so that a goal outlives a session that failed."""
+"""Delay before another session is tried [s]; well below `LEASE_S`, so that a goal survives a failed session."""
 SILENT_S = 2.0
 INFO_EVERY_S = 0.5
 CLOSING_S = 6.0
-"""A query that is not answered, 2 s, and a session that hangs when it is closed, 2 s."""
+"""Time limit of closing [s]: 2 s for an unanswered query, 2 s for a session that hangs while it is closed."""
 Publish = Callable[[str, bytes, bool], None]
 
 
 class LinkDownError(Exception):
-    """There is no daemon to command now; the text says why."""
+    """No daemon can be commanded now; the text has the reason."""
 
 
 class CellLink:
-    """Reads a cell and commands it. ``publish(slot, message, keep)``: a message for all pages, as JSON text or, of
-    pictures, bytes; of one slot only the newest counts, unless the slot is empty; ``keep``: new pages get it, too.
+    """Receives what a cell publishes, and commands it.
 
+    ``publish(slot, message, keep)``: called with messages for all pages: JSON text or, for pictures, bytes. Only the
+    newest message of a slot counts, unless the slot is empty; ``keep``: new pages receive it, too.
     ``log``: called with a line on every motion that was aborted or failed, with all its reasons.
 
-    Raises NotRunningError, SessionError, ClientError where the cell cannot be reached at the start.
+    Raises NotRunningError, SessionError, ClientError if the cell cannot be reached at the start.
     """
 
     recording: Literal[False] = False
@@ -82,7 +83,7 @@ class CellLink:
         self._thread = threading.Thread(target=self._work, name="cell-link", daemon=True)
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start publishing."""
         self._thread.start()
         self._leases.start()
 
@@ -110,19 +111,19 @@ class CellLink:
                 self._read(self._client)
             except (ClientError, NotRunningError, SessionError, OSError) as error:
                 self._why = str(error)
-            except Exception as error:  # whatever a cell sends: pages are told, and the link begins anew
+            except Exception as error:  # whatever a cell sends: the pages are informed, and the link restarts
                 self._why = f"what the cell sends cannot be read: {type(error).__name__}: {error}"
             self._tell("link", {"up": False, "why": self._why})
             client, self._client = self._client, None
             if client is not None:
                 closing = threading.Thread(target=client.close, name="cell-link-close", daemon=True)
-                closing.start()  # of a session that hangs: seconds, longer than leases last
+                closing.start()  # of a session that hangs: takes seconds, longer than a lease
                 if self._ended.is_set():
                     closing.join()
             self._ended.wait(AGAIN_S)
 
     def _read(self, client: Client) -> None:
-        """Publish what ``client`` receives, until the daemon goes away. Raises ClientError."""
+        """Publish what ``client`` receives, until the daemon ends. Raises ClientError."""
         self._epoch, self._goal = -1, ""
         self._tell_info(client)
         self._tell("link", {"up": True, "why": ""})
@@ -176,7 +177,7 @@ class CellLink:
         try:
             model = decode_model(client.query(client.keys.model))
         except NoReplyError:
-            raise  # asked again over another session
+            raise  # requested again over another session
         except (ClientError, ModelFileError) as error:
             self._tell("", {"notice": f"the model cannot be shown: {error}", "t_wall": time.time()})
             return
@@ -195,11 +196,11 @@ class CellLink:
         self._tell("", {"event": event})
 
     def _tell_goal(self, client: Client, goal: str) -> None:
-        """Publish what is drawn of a ``goal`` that has begun, whoever sent it."""
+        """Publish the drawing data of a ``goal`` that has started, whoever sent it."""
         self._goal = goal
         try:
             running = client.running_goals() if goal else ()
-        except ClientError as error:  # such as of a daemon that is older
+        except ClientError as error:  # e.g. of an older daemon
             self._tell("", {"notice": f"goal {goal} cannot be drawn: {error}", "t_wall": time.time()})
             return
         for one in running:
@@ -207,7 +208,7 @@ class CellLink:
                 self._tell("goal", self.view.goal(one.goal, one.plan), keep=True)
 
     def _take_picture(self, sample: Any) -> None:
-        if sample.attachment is None:  # no picture of a camera process
+        if sample.attachment is None:  # not a picture of a camera process
             return
         camera = str(sample.key_expr).rpartition("/")[2]
         data = picture_message(sample.attachment.to_bytes(), sample.payload.to_bytes())
@@ -224,7 +225,7 @@ class CellLink:
 
     @property
     def client(self) -> Client:
-        """The live client. Raises LinkDownError."""
+        """The connected client. Raises LinkDownError."""
         client = self._client
         if client is None:
             raise LinkDownError(self._why or "the daemon is not there")
@@ -239,7 +240,7 @@ class CellLink:
         return np.array(list(self._state.joints.values()))
 
     def dragged_goal(self, joints: FloatArray) -> Goal:
-        """The goal with the set-points of the posture ``joints`` (n,), of the markers that are seen now.
+        """The goal with the set-points of the posture ``joints`` (n,), of the markers that are visible now.
 
         Raises LinkDownError, GeometryError.
         """
@@ -284,15 +285,15 @@ class CellLink:
         self.client.update(command.id, command.target, command.stamp_s)
 
     def calibrate(self, check: bool) -> Reply:
-        """Begin a calibration, or a check motion; its events tell the rest. Raises ClientError, LinkDownError."""
+        """Start a calibration, or a check motion; events report its progress. Raises ClientError, LinkDownError."""
         client = self.client
         command = Calibrate(Client.make_goal(TaughtTarget("x")).id, check=check, lease_s=LEASE_S)
         with self._leases.held(command.id):
             return client.command("calibrate", command)
 
     def stop(self, operator: str) -> Reply:
-        """Stop the arm in the name of ``operator``, over a session of its own where the link's is down, closed or does
-        not answer.
+        """Stop the arm in the name of ``operator``; over a separate session if the link's is down, closed or
+        unresponsive.
 
         Raises ClientError, NotRunningError, SessionError.
         """
@@ -311,12 +312,12 @@ class CellLink:
         return self.client.cancel(goal)
 
     def end_leases(self) -> None:
-        """Renew no lease any more: what the page has started ends within `LEASE_S`."""
+        """Stop renewing leases: motions started by the page end within `LEASE_S`."""
         self._leases.end()
 
 
 def why(event: EventMessage) -> str:
-    """What an event says of its reasons: its message, and codes, values and hints of them."""
+    """Text on an event's reasons: its message, and their codes, values and hints."""
     found = [event.message] if event.message else []
     for reason in event.reasons:
         value = "" if reason.value is None else f" {reason.value:.4g}"
@@ -328,12 +329,12 @@ def why(event: EventMessage) -> str:
 
 
 def picture_message(header: bytes, jpeg: bytes) -> bytes:
-    """A picture as pages get it: the size of the header (4 bytes, little-endian), the header, a JPEG."""
+    """A picture in the pages' format: the size of the header (4 bytes, little-endian), the header, a JPEG."""
     return struct.pack("<I", len(header)) + bytes(header) + jpeg
 
 
 def refusal(error: Exception) -> dict[str, Any]:
-    """A failure as a page shows it, whole: text, problems and reasons."""
+    """A failure as a page shows it, with text, problems and reasons."""
     found: dict[str, Any] = {"ok": False, "message": str(error)}
     if isinstance(error, RefusedError):
         found["reply"] = error.reply

@@ -1,4 +1,4 @@
-"""A recording in the place of a live cell: pages are sent the same messages, at the time that they have chosen."""
+"""A recording in place of a live cell: pages receive the same messages, at the time that they have chosen."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ EVENTS_SHOWN = 100
 
 
 class FlightLink:
-    """Shows the recording ``path`` to pages, from its begin on, while it is still being read.
+    """Plays the recording ``path`` to pages, from its beginning, while it is still being read.
 
-    All pages see the same moment. Raises RecordingError where it cannot be read.
+    All pages show the same time. Raises RecordingError if it cannot be read.
     """
 
     recording: Literal[True] = True
@@ -63,7 +63,7 @@ class FlightLink:
             threading.Thread(target=self._show, name="flight-show", daemon=True),
         )
         self.watched = threading.Event()
-        """Set by every page that is opened: it is sent what there is now."""
+        """Set by every page that is opened: it is then sent the current messages."""
 
     @property
     def silent_s(self) -> float:
@@ -71,12 +71,12 @@ class FlightLink:
         return 0.0
 
     def start(self) -> None:
-        """Begin to read and to play."""
+        """Start reading and playing."""
         for thread in self._threads:
             thread.start()
 
     def close(self) -> None:
-        """End both. Idempotent."""
+        """Stop both. Idempotent."""
         self._reader.ended.set()
         self._ended.set()
         for thread in self._threads:
@@ -87,7 +87,7 @@ class FlightLink:
         """There are none."""
 
     def play(self, playing: bool, speed: float | None) -> dict[str, Any]:
-        """Play, from the begin where it is at its end, or pause."""
+        """Play, from the beginning if it is at its end, or pause."""
         with self._lock:
             self._speed = self._speed if speed is None else speed
             if playing and self._at_ns >= self._span.last_ns:
@@ -96,7 +96,7 @@ class FlightLink:
             return {"message": f"playing, {self._speed:g} times as fast" if playing else "paused"}
 
     def seek(self, seconds: float) -> dict[str, Any]:
-        """Go to a time [s] after the recording's begin; as far as it was read by now."""
+        """Seek to a time [s] after the recording's beginning, at most to the last step read so far."""
         with self._lock:
             wanted = self._span.first_ns + round(seconds * 1e9)
             self._at_ns = min(max(wanted, self._span.first_ns), self._read_ns())
@@ -130,7 +130,7 @@ class FlightLink:
                 self._publish("flight", state, True)
 
     def _advance(self, seconds: float) -> tuple[int, bool]:
-        """The present moment, and whether it is no continuation of the last one."""
+        """The current time of the playback [ns], and whether it has jumped since the last call."""
         with self._lock:
             jumped, self._jumped = self._jumped, False
             if self._playing:
@@ -142,7 +142,7 @@ class FlightLink:
         return self._threads[0].is_alive() or at_ns < self._read_ns()
 
     def _show_moment(self, at_ns: int, shown: dict[str, int]) -> None:
-        """Publish what is new at ``at_ns``: of each slot the newest message, of events all that came before."""
+        """Publish what is new at ``at_ns``: the newest message of each slot, and all events up to then."""
         for slot in self._timeline.slots:
             count = self._timeline.count(slot, at_ns)
             if count == shown.get(slot, 0):
@@ -175,17 +175,17 @@ class FlightLink:
 
 
 # -- messages over time --------------------------------------------------------------------------------------
-# A flight recording as the messages that pages get of a live cell, each at its time: replayed once, and kept in a file
-# without a name, so that any moment of it can be shown.
+# A flight recording as the messages that pages receive from a live cell, each with its time: replayed once, and stored
+# in a file without a name, so that any time of it can be shown.
 
 
 STATE_EVERY_NS = 50_000_000
 PLOT_NS = 60_000_000_000
-"""What the plots show of the past."""
+"""Duration that the plots show [s]."""
 
 
 class Timeline:
-    """Messages by slot, in order of time. One thread adds, others read."""
+    """Messages by slot, in order of time. One thread writes, others read."""
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="stereoservo-flight-")  # noqa: SIM115
@@ -196,7 +196,7 @@ class Timeline:
         self._rows: list[tuple[float | None, ...]] = []
         self._reasons: list[tuple[float, tuple[str, ...]]] = []
         self.read_ns = 0
-        """Up to here the recording was read."""
+        """Time up to which the recording was read [ns]."""
 
     def add(self, slot: str, t_ns: int, data: bytes) -> None:
         """Append a message. Raises OSError on a full disk."""
@@ -215,7 +215,7 @@ class Timeline:
         velocities: list[float | None],
         codes: tuple[str, ...],
     ) -> None:
-        """Append what is plotted of one state; ``codes``: of its reasons."""
+        """Append the plotted values of one state; ``codes``: of its reasons."""
         with self._lock:
             self._rows.append((t_ns * 1e-9, error, late_us, *velocities))
             self._reasons.append((t_ns * 1e-9, codes))
@@ -227,12 +227,12 @@ class Timeline:
             return tuple(self._times)
 
     def count(self, slot: str, t_ns: int) -> int:
-        """How many messages of ``slot`` are not after ``t_ns``."""
+        """Number of messages of ``slot`` up to ``t_ns``."""
         with self._lock:
             return bisect_right(self._times.get(slot, []), t_ns)
 
     def message(self, slot: str, number: int) -> bytes:
-        """Message ``number`` of ``slot``, from 0."""
+        """Message ``number`` of ``slot``, counted from 0."""
         with self._lock:
             begin, size = self._places[slot][number]
         return os.pread(self._file.fileno(), size, begin)
@@ -274,12 +274,12 @@ class FlightReader:
         self._late: deque[float] = deque(maxlen=250)
         self._videos: list[_Video] = []
         self.ended = threading.Event()
-        """Set from outside: it reads no further."""
+        """Set by another thread to end the reading."""
         self.notes: list[str] = []
-        """What is to be known of the recording, for people."""
+        """Remarks on the recording, for people."""
 
     def read(self) -> None:
-        """Read the recording, to its end or where it is damaged, which `notes` then tell."""
+        """Read the recording, to its end or to where it is damaged; `notes` then report that."""
         self._open_videos()
         try:
             result = replay(self._path, observe=self._take, header=self._begin)
@@ -341,7 +341,7 @@ class FlightReader:
         self._timeline.read_ns = now_ns
 
     def _take_goals(self, inputs: StepInputs, outputs: StepOutputs) -> None:
-        """Goals that are sent, planned and moved, drawn from when they run."""
+        """Goals that are sent, planned and moved, drawn from their start on."""
         told = ""
         for request in inputs.requests:
             command = request.command
@@ -417,11 +417,11 @@ class FlightReader:
 
 
 class _EndedError(Exception):
-    """Nobody needs the rest of the recording."""
+    """Raised to end the replay: the rest of the recording is no longer needed."""
 
 
 class _Video:
-    """A camera's recorded pictures, in step with the replay."""
+    """A camera's recorded pictures, synchronized with the replay."""
 
     def __init__(self, path: Path) -> None:
         self._reader = ImageReader(path)
@@ -429,7 +429,7 @@ class _Video:
         self._shown_ns = -EVERY_NS
 
     def newest(self, now_ns: int) -> Frame | None:
-        """The newest picture until ``now_ns`` that was not given yet, not more often than a live page gets them."""
+        """The newest picture up to ``now_ns`` that was not returned yet, at most at the rate of a live page."""
         found = None
         while self._next is not None and self._next.t_shutter_ns <= now_ns:
             found, self._next = self._next, self._reader.read()

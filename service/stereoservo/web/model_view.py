@@ -1,4 +1,4 @@
-"""What pages are shown of a learnt model at some joints: predictions, the scene, and a dragged posture."""
+"""Data that pages draw from a learnt model at given joints: predictions, the scene, and a dragged posture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereoservo.numerics.arrays import FloatArray
 
 @dataclass(frozen=True)
 class ModelView:
-    """A model as it is drawn; without one (None) nothing is."""
+    """Drawing data of a model; empty without a model (None)."""
 
     model: DragModel | None = None
     scene: Scene | None = None
@@ -32,7 +32,7 @@ class ModelView:
         return cls(DragModel(model, limits), Scene.of(model))
 
     def at(self, state: StateMessage) -> dict[str, Any]:
-        """``predicted`` pixels and the ``scene`` at the joints of ``state``, beside which a page gets them."""
+        """``predicted`` pixels and the ``scene`` at the joints of ``state``, published along with it."""
         joints = np.array(list(state.joints.values()))
         model = self.model
         if model is None or joints.shape != model.model.zero.shape or not np.isfinite(joints).all():
@@ -43,8 +43,8 @@ class ModelView:
         }
 
     def goal(self, goal: Goal, plan: PlanReport | None) -> dict[str, Any]:
-        """What a page draws of a goal that runs: its plan, its set-points where it states pixels, and in the ``scene``
-        the markers (m, 3) where the plan ends, else None.
+        """Drawing data of a running goal: its plan, its set-points if it has pixels, and in the ``scene`` the markers
+        (m, 3) at the end of the plan, else None.
         """
         points = None
         if self.scene is not None and plan is not None and len(plan.joints) == len(self.scene.chain.kinds):
@@ -54,7 +54,7 @@ class ModelView:
 
 
 def by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[float]]]:
-    """Pixels (c, m, 2) by camera and marker; those that are not there are left out."""
+    """Pixels (c, m, 2) by camera and marker, without missing ones."""
     return {
         camera: {
             marker: pixel.tolist()
@@ -66,7 +66,7 @@ def by_camera(model: DragModel, pixels: FloatArray) -> dict[str, dict[int, list[
 
 
 def drag_answer(model: DragModel, joints: FloatArray, camera: str, left_px: float) -> dict[str, Any]:
-    """What a page draws of a dragged posture: pixels, and the epipolar lines of the body's middle."""
+    """Drawing data of a dragged posture: pixels, and the epipolar lines of the body's centroid."""
     pixels = model.pixels(joints)
     c = model.cameras.index(camera)
     u, v = pixels[c].mean(axis=0).tolist()
@@ -80,28 +80,28 @@ def drag_answer(model: DragModel, joints: FloatArray, camera: str, left_px: floa
 
 
 def no_goal() -> dict[str, Any]:
-    """What a page draws while no goal runs."""
+    """Drawing data while no goal runs."""
     return {"goal": {"id": "", "plan": None, "set_points": {}, "scene": None}}
 
 
 # -- dragged postures ----------------------------------------------------------------------------------------
-# A goal by dragging the marker body in one picture: in the others its markers follow along their epipolar lines, and
-# the kinematics of the learnt model make of it a posture that the arm can take.
+# A goal by dragging the marker body in one picture: in the other pictures its markers follow along their epipolar
+# lines, and the kinematics of the learnt model fit a posture that the arm can take.
 #
-# Nothing here needs a metric model: only a plane at infinity, by which the depth in the dragged picture stays.
+# This does not need a metric model, only a plane at infinity, which fixes the depth in the dragged picture.
 
 
 ITERATIONS = 40
 DAMPING, LEAST_DAMPING, LARGEST_DAMPING = 1e-3, 1e-12, 1e6
-"""First, least and largest damping, relative to the largest diagonal entry of the normal equations."""
+"""Initial, least and largest damping, relative to the largest diagonal entry of the normal equations."""
 CONVERGED_PX = 1e-6
 LINE_STEPS = 24
 
 
 @dataclass(frozen=True)
 class DraggedGoal:
-    """A posture ``joints`` (n,), its raw pixels (c, m, 2) of all markers, NaN where none, and how far the dragged
-    picture is from what was asked, rms [px].
+    """A posture ``joints`` (n,), its raw pixels (c, m, 2) of all markers, NaN where there are none, and the rms
+    distance [px] of the dragged picture from the requested one.
     """
 
     joints: FloatArray
@@ -112,7 +112,7 @@ class DraggedGoal:
 class DragModel:
     """A learnt model, for dragging: predictions, epipolar lines, and the posture that follows a drag.
 
-    ``limits`` (n, 2): joint positions [rad or m] that may be taken.
+    ``limits`` (n, 2): allowed joint positions [rad or m].
     """
 
     def __init__(self, model: CellModel, limits: FloatArray) -> None:
@@ -123,7 +123,7 @@ class DragModel:
         self._chain = ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first)
 
     def pixels(self, joints: FloatArray) -> FloatArray:
-        """Raw pixels (c, m, 2) of the markers at ``joints`` (n,); NaN where a lens shows none."""
+        """Raw pixels (c, m, 2) of the markers at ``joints`` (n,); NaN outside of a lens's image."""
         return self._raw(self._ideal(joints))
 
     def dragged(
@@ -134,12 +134,13 @@ class DragModel:
         turn: float = 0.0,
         nearer: float = 1.0,
     ) -> DraggedGoal:
-        """The posture near ``start`` (n,) at which the middle of the markers is moved by ``shift`` [px] in ``camera``.
+        """The posture near ``start`` (n,) at which the centroid of the markers is moved by ``shift`` [px] in
+        ``camera``.
 
-        One picture leaves the depth open: it stays, in the sense of the model's plane at infinity, so that the body
-        moves parallel to the picture without turning; ``nearer`` multiplies it. ``turn`` [rad] turns the body about the
-        ray through its middle. In the other cameras every marker thereby moves along its epipolar line. The posture
-        is the least-squares one in all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
+        One picture does not determine the depth. It is held constant with respect to the model's plane at infinity, so
+        the body moves parallel to the picture without turning; ``nearer`` multiplies it. ``turn`` [rad] turns the body
+        about the ray through its centroid. In the other cameras every marker moves along its epipolar line. The posture
+        is the least-squares one over all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
         """
         c = self._index(camera)
         wanted = project_many(self._Ps, self._wanted(c, self._points(start), np.array(shift), turn, nearer))
@@ -151,7 +152,7 @@ class DragModel:
         return DraggedGoal(joints, self._raw(reached), left)
 
     def _wanted(self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float) -> FloatArray:
-        """Markers (m, 4) as `dragged` asks for them; they may be no displacement that the arm can make."""
+        """Markers (m, 4) requested by `dragged`; the arm may be unable to make this displacement."""
         lens, P = self.model.cameras[c].lens, self._Ps[c, None]
         middle = points.mean(axis=0)
         centre = project_many(P, middle[None])[0]
@@ -169,7 +170,7 @@ class DragModel:
         return placed
 
     def _on_rays(self, c: int, ideal: FloatArray, depths: FloatArray) -> FloatArray:
-        """Points (m, 4) of height 1 that camera ``c`` sees at ideal pixels (m, 2) with ``depths`` (m,)."""
+        """Points (m, 4) of scale 1 that camera ``c`` sees at ideal pixels (m, 2) with ``depths`` (m,)."""
         rows = np.vstack([self._Ps[c], self.model.plane_at_infinity])
         sides = np.column_stack([depths[:, None] * ideal, depths, np.ones(len(ideal))])
         found: FloatArray = np.linalg.solve(rows, sides.T).T
@@ -215,7 +216,7 @@ class DragModel:
         return lines
 
     def _fitted(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Joints (n,) within the limits whose ideal pixels are nearest to ``wanted`` (c, m, 2)."""
+        """Joints (n,) within the limits with ideal pixels nearest to ``wanted`` (c, m, 2)."""
         low, high = self.limits.T
         q = np.clip(start, low, high)
         residual = (wanted - self._ideal(q)).ravel()
@@ -232,7 +233,7 @@ class DragModel:
             tried[free] += np.linalg.solve(A, downhill[free])
             tried = np.clip(tried, low, high)
             left = (wanted - self._ideal(tried)).ravel()
-            if not left @ left < residual @ residual:  # NaN in a focal plane is no progress
+            if not left @ left < residual @ residual:  # NaN in a focal plane: not an improvement
                 damping *= 10.0
                 if damping > LARGEST_DAMPING:
                     break
@@ -253,7 +254,7 @@ def _feet(lines: FloatArray, pixels: FloatArray) -> FloatArray:
 
 
 def _across(line: FloatArray, width: int, height: int) -> FloatArray:
-    """Points (k, 2) along a line (3,) over the picture and a little beyond."""
+    """Points (k, 2) along a line (3,) across the picture and slightly beyond."""
     middle = 0.5 * np.array([[width, height]])
     foot = _feet(line[None], middle)[0]
     along = np.array([-line[1], line[0]]) / np.hypot(line[0], line[1])
@@ -263,12 +264,12 @@ def _across(line: FloatArray, width: int, height: int) -> FloatArray:
 
 
 # -- the scene -----------------------------------------------------------------------------------------------
-# What a metric model shows in three dimensions: joint axes, markers and cameras in its Euclidean frame.
+# Three-dimensional scene of a metric model: joint axes, markers and cameras in its Euclidean frame.
 
 
 @dataclass(frozen=True)
 class Scene:
-    """The scene of a metric model of cameras that stand; its unit of length is the model's own."""
+    """The scene of a metric model with static cameras; its unit of length is the model's own."""
 
     chain: ProjectiveChain
     points: FloatArray
@@ -276,7 +277,7 @@ class Scene:
 
     @classmethod
     def of(cls, model: CellModel) -> Self | None:
-        """The scene of ``model``; None where it is not metric, or its cameras ride on the arm."""
+        """The scene of ``model``; None if it is not metric, or its cameras are mounted on the arm."""
         if model.stratum != "metric" or model.tip_first:
             return None
         parts = framed(model)

@@ -1,6 +1,5 @@
-"""Who may do what through the page: host and origin of a request, the one-time token of an operator, the one page
-that holds the arm, and the leases of what it has started. Everything is decided on the server, before a request goes
-anywhere.
+"""Access rights of pages: host and origin of a request, the one-time token of an operator, the one page that holds the
+arm, and the leases of the motions that it has started. The server checks everything before it forwards a request.
 """
 
 from __future__ import annotations
@@ -23,13 +22,13 @@ LOOPBACK = ("localhost", "127.0.0.1", "[::1]")
 
 
 class RightsError(Exception):
-    """A request that is not allowed; the text says why, and what would be."""
+    """A request that is not allowed; the text has the reason, and what would be allowed."""
 
 
 def allowed_hosts(address: str, port: int, names: Sequence[str] = ()) -> frozenset[str]:
-    """Values of the header ``Host`` that name this server, an address or name with its port.
+    """Valid values of the header ``Host``: names or addresses of this server, with its port.
 
-    ``names``: more of them. One that listens beyond loopback has the computer's name, too.
+    ``names``: further names. A server that listens beyond loopback accepts the computer's name, too.
     """
     if address in ("localhost", "127.0.0.1", "::1"):
         own = {*LOOPBACK, address}
@@ -40,15 +39,15 @@ def allowed_hosts(address: str, port: int, names: Sequence[str] = ()) -> frozens
 
 
 def _values(name: str, port: int) -> tuple[str, ...]:
-    """What browsers send as ``Host`` for a name or address; they leave out the ports of http and https."""
+    """Values that browsers send as ``Host`` for a name or address; they omit the ports of http and https."""
     written = f"[{name}]" if ":" in name and not name.startswith("[") else name
     return (f"{written}:{port}", written) if port in (80, 443) else (f"{written}:{port}",)
 
 
 def check_host(host: str | None, allowed: frozenset[str], reached: str, port: int) -> None:
-    """Raises RightsError unless ``host`` names this server: another page's name may resolve to it (DNS rebinding).
+    """Raise RightsError unless ``host`` names this server: another page's name may resolve to it (DNS rebinding).
 
-    ``reached``: the address of this computer at which the request came in, which is a name of it, too; a page of
+    ``reached``: the address of this computer at which the request arrived, which is a valid name, too; a page of
     another origin has a name of its own.
     """
     if host is None or host.lower() not in {*allowed, *_values(reached, port)}:
@@ -58,7 +57,7 @@ def check_host(host: str | None, allowed: frozenset[str], reached: str, port: in
 
 
 def check_origin(origin: str | None, host: str | None, secure: bool) -> None:
-    """Raises RightsError where a browser says that another page opens the WebSocket.
+    """Raise RightsError if a browser reports that another page opens the WebSocket.
 
     Programs send no ``Origin``; browsers always do.
     """
@@ -70,10 +69,10 @@ def check_origin(origin: str | None, host: str | None, secure: bool) -> None:
 
 
 class ArmHolder:
-    """Which page holds the arm: the one that has shown the token, until it is closed.
+    """Record of the page that holds the arm: the one that presented the token, until it is closed.
 
-    ``operator``: the name given with ``--operate``; None: nobody may hold it. ``announce``: called with each new token;
-    one is made at the start, and another as soon as one has been used, so that none works twice.
+    ``operator``: the name given with ``--operate``; None: no page may hold the arm. ``announce``: called with each new
+    token; one is made at the start, and another as soon as one has been used, so that each is valid once.
     """
 
     def __init__(self, operator: str | None, announce: Callable[[str], None]) -> None:
@@ -106,7 +105,7 @@ class ArmHolder:
             self._renew()
 
     def release(self, page: object) -> bool:
-        """End ``page``'s hold; returns whether it had it."""
+        """Release the arm if ``page`` holds it; returns whether it did."""
         with self._lock:
             had = self._holder is page
             if had:
@@ -119,11 +118,11 @@ class ArmHolder:
 
     @property
     def taken(self) -> bool:
-        """Whether a page holds the arm."""
+        """Whether any page holds the arm."""
         return self._holder is not None
 
     def require(self, page: object, what: str) -> None:
-        """Raises RightsError unless ``page`` holds the arm."""
+        """Raise RightsError unless ``page`` holds the arm."""
         if self._holder is not page:
             how = (
                 "this page is read-only and may stop the arm, nothing else"
@@ -134,26 +133,26 @@ class ArmHolder:
 
 
 # -- leases --------------------------------------------------------------------------------------------------
-# Leases of what the page that holds the arm has started: renewed as long as that page is there, over whatever session
+# Leases of motions started by the page that holds the arm: renewed as long as that page is open, over whatever session
 # with the daemon is open.
 
 
 LEASE_S = 2.0
-"""A page that is closed, or loses its server, stops the arm after it."""
+"""Time [s] after which the arm stops if its page was closed, or lost its server."""
 RENEW_EVERY_S = LEASE_S / 8.0
-"""Seven renewals may be late or lost: a session that is opened anew, or a machine that stalls, costs no goal."""
+"""Interval of renewals [s]. Seven may be late or lost: a reconnected session or a stalled machine ends no goal."""
 ENDS = (*TERMINAL, "calibration_finished", "check_finished", "calibration_aborted", "calibration_failed")
 
 
 class Renewing(Protocol):
-    """What renews a lease: a `stereoservo.client.Client`."""
+    """Interface that renews a lease: a `stereoservo.client.Client`."""
 
     def renew(self, goal_id: str) -> None:
         """Renew the lease of a motion."""
 
 
 class Leases:
-    """Renews leases from a thread; ``client``: the one of the present session, None while there is none."""
+    """Renews leases from a thread; ``client`` returns the current session's, None while there is none."""
 
     def __init__(self, client: Callable[[], Renewing | None]) -> None:
         self._client = client
@@ -163,7 +162,7 @@ class Leases:
         self._thread = threading.Thread(target=self._work, name="page-leases", daemon=True)
 
     def start(self) -> None:
-        """Begin to renew."""
+        """Start renewing."""
         self._thread.start()
 
     def _work(self) -> None:
@@ -171,7 +170,7 @@ class Leases:
             self.renew()
 
     def renew(self) -> None:
-        """Renew all that were accepted, where there is a session; one that is closed meanwhile is soon replaced."""
+        """Renew all accepted motions, if there is a session; one that is closed meanwhile is soon replaced."""
         client = self._client()
         if client is not None:
             for motion in self.renewed:
@@ -186,10 +185,10 @@ class Leases:
 
     @contextmanager
     def held(self, motion: str) -> Iterator[None]:
-        """Renew the lease of ``motion`` once what is done within has returned: it asks for the motion.
+        """Context manager around the request for ``motion``: once it has returned, renew the motion's lease.
 
-        Not before: a lease of what is not accepted yet would be refused. Its end may be told before its acceptance is:
-        then it is not renewed.
+        Not earlier: a renewal would be refused before the motion is accepted. If its end is reported before its
+        acceptance, it is not renewed.
         """
         with self._lock:
             self._accepted[motion] = False
@@ -203,7 +202,7 @@ class Leases:
                 self._accepted[motion] = True
 
     def take_event(self, event: EventMessage) -> None:
-        """Renew no longer what ``event`` ends, or what the daemon does not know any more (its end went unheard)."""
+        """Stop renewing a motion that ``event`` ends, or that the daemon no longer has (its end was not received)."""
         unknown = event.kind == "goal_refused" and any(reason.code == "NO_SUCH_GOAL" for reason in event.reasons)
         if event.kind in ENDS or (unknown and event.id in self.renewed):
             self._drop(event.id)
@@ -213,12 +212,12 @@ class Leases:
             self._accepted.pop(motion, None)
 
     def end(self) -> None:
-        """Renew none any more: what was started ends within `LEASE_S`."""
+        """Stop renewing all leases: the motions end within `LEASE_S`."""
         with self._lock:
             self._accepted.clear()
 
     def close(self) -> None:
-        """End all and the thread. Idempotent."""
+        """End all leases and the thread. Idempotent."""
         self.end()
         self._closed.set()
         if self._thread.is_alive():

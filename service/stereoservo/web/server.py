@@ -1,5 +1,5 @@
-"""The page's server: static files and one WebSocket, over which pages receive what the cell publishes and ask for what
-their rights allow. `docs/web.md` has the messages.
+"""The page's server: static files and one WebSocket, over which pages receive what the cell publishes and send
+requests, as far as their rights allow. `docs/web.md` has the messages.
 """
 
 from __future__ import annotations
@@ -51,15 +51,14 @@ MAX_PAGES = 16
 MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
 TICK_S = 0.2
-"""How often pages are told that the server lives, and since when the cell is silent."""
+"""Interval of messages to pages that the server is alive, with the time since the cell's last state [s]."""
 MAX_UNDER_WAY, MAX_STOPS = 8, 32
-"""Requests of a page that are carried out at a time, and stops, which wait for none of them."""
+"""Largest numbers of concurrent requests of a page, and of stops, which do not wait for the requests."""
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
 PING_S, SILENT_S = 2.0, 3.0
-"""A page is asked every so often whether it is there, and closed where it does not answer for so long; one that holds
-the arm then lets it stop. A browser on a busy computer is late by tenths of a second; a page that is closed in error
-costs a goal.
+"""Interval of pings to a page, and time limit of its answers [s]: a page without an answer is closed; if it holds the
+arm, the arm stops. A browser on a busy computer is late by tenths of a second; closing a page in error costs a goal.
 """
 EXPECTED = (
     ClientError,
@@ -73,7 +72,9 @@ EXPECTED = (
 
 
 class RecordedLink(Protocol):
-    """A recording in the place of a cell, `web.flight_link.FlightLink`: this module knows nothing of recordings."""
+    """Interface of a recording in place of a cell, `web.flight_link.FlightLink`: this module does not depend on
+    recordings.
+    """
 
     recording: Literal[True]
     cell: str
@@ -85,10 +86,10 @@ class RecordedLink(Protocol):
         """A recording is never silent: 0."""
 
     def start(self) -> None:
-        """Begin to publish."""
+        """Start publishing."""
 
     def close(self) -> None:
-        """End. Idempotent."""
+        """Stop. Idempotent."""
 
     def end_leases(self) -> None:
         """There are none."""
@@ -97,11 +98,11 @@ class RecordedLink(Protocol):
         """Play or pause."""
 
     def seek(self, seconds: float) -> dict[str, Any]:
-        """Go to a time [s] after the recording's begin."""
+        """Seek to a time [s] after the recording's beginning."""
 
 
 class Page:
-    """One open page: what waits to be sent to it, and the goal that it is making; ``name``: by which it stops."""
+    """One open page: its queue of messages, and the goal being made in it; ``name``: sender of its stops."""
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -112,12 +113,12 @@ class Page:
         self.draft: FloatArray | None = None
         self.checked: Goal | None = None
         self.changes = 0
-        """Drags and checks so far: what was checked is what is sent only where none came in between."""
+        """Number of drags and checks so far: a checked goal is sent only if none came in between."""
         self._under_way = 0
 
     @contextmanager
     def under_way(self, what: str) -> Iterator[None]:
-        """A request is being carried out. Raises RightsError where too many are."""
+        """Context manager of a request in progress. Raises RightsError if too many are."""
         if self._under_way >= MAX_UNDER_WAY:
             raise RightsError(
                 f"{what}: {self._under_way} requests of this page are being carried out, {MAX_UNDER_WAY} are allowed: "
@@ -130,7 +131,7 @@ class Page:
             self._under_way -= 1
 
     def put(self, slot: str, data: bytes) -> None:
-        """Queue a message; of one slot only the newest is kept."""
+        """Queue a message that replaces an older one of the same slot."""
         if slot:
             self.newest[slot] = data
         else:
@@ -143,7 +144,7 @@ class Page:
 
 
 class PageServer:
-    """Serves pages of one cell. ``make_link``: makes the link to it, given what publishes to the pages.
+    """Serves pages of one cell. ``make_link`` makes the link to it, given the function that publishes to the pages.
 
     ``operator``: the name under which one page may command the arm; None: none may. ``announce``: called with each new
     token of that operator. Raises what ``make_link`` does.
@@ -169,7 +170,7 @@ class PageServer:
         self.link = make_link(self._publish)
 
     async def start(self, address: str, port: int, tls: ssl.SSLContext | None = None, names: Sequence[str] = ()) -> int:
-        """Listen; returns the port (given as 0: a free one). ``names``: more names of this server. Raises OSError."""
+        """Listen on a port (0: any free one); returns it. ``names``: further names of this server. Raises OSError."""
         self._loop = asyncio.get_running_loop()
         self._secure = tls is not None
         self._server: Server = await serve(
@@ -193,10 +194,10 @@ class PageServer:
         return found
 
     async def close(self) -> None:
-        """Close all pages, end their goals' leases, leave the daemon. Idempotent."""
+        """Close all pages, end their goals' leases, disconnect from the daemon. Idempotent."""
         self._ticks.cancel()
         self._server.close()
-        with suppress(TimeoutError):  # whoever keeps a connection open must not keep the server
+        with suppress(TimeoutError):  # an open connection must not keep the server running
             await asyncio.wait_for(self._server.wait_closed(), CLOSING_S)
         await asyncio.to_thread(self.link.close)
         self._work.shutdown(wait=False, cancel_futures=True)
@@ -205,7 +206,7 @@ class PageServer:
     # -- HTTP ---------------------------------------------------------------------------------------------------
 
     def _static(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The page's files; None lets a WebSocket open."""
+        """The page's files; None accepts a WebSocket."""
         hosts = request.headers.get_all("Host")
         host = hosts[0] if len(hosts) == 1 else None
         try:
@@ -230,7 +231,7 @@ class PageServer:
     # -- WebSocket ----------------------------------------------------------------------------------------------
 
     def _publish(self, slot: str, data: bytes, keep: bool) -> None:
-        """Called by the link's thread."""
+        """Publish a message; called by the link's thread."""
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(self._spread, slot, data, keep)
 
@@ -296,7 +297,7 @@ class PageServer:
             self._tell_rights(page)
 
     async def _answer(self, page: Page, message: str | bytes) -> None:
-        """Do what a page asks, as far as it may, and tell it how that went."""
+        """Execute a page's request, as far as it is allowed, and send the page the result."""
         n = 0
         try:
             data = message.encode() if isinstance(message, str) else message
@@ -315,7 +316,7 @@ class PageServer:
                     answer = {"ok": True} | await self._run(self._work, page, request)
         except EXPECTED as error:
             answer = refusal(error)
-        except Exception as error:  # told to the page; the next request is answered as usual
+        except Exception as error:  # sent to the page; the next request is answered as usual
             answer = {"ok": False, "message": f"the page's server failed: {type(error).__name__}: {error}"}
         self._let_go(page)
         page.tell({"answer": {"n": n, **answer}})
@@ -325,14 +326,14 @@ class PageServer:
         return await self._loop.run_in_executor(pool, self._do, page, request)
 
     def _let_go(self, page: Page) -> None:
-        """What a page was still doing when it was closed, or gave up the arm, must not outlive that."""
+        """End what a page has started, when it was closed or has released the arm."""
         if page not in self._pages:
             self.holder.release(page)
-        if not self.holder.taken:  # else its leases are another page's by now
+        if not self.holder.taken:  # otherwise the leases belong to another page now
             self.link.end_leases()
 
     def _do(self, page: Page, request: PageRequest) -> dict[str, Any]:
-        """Carry out a request that is allowed, in a thread. Raises what `EXPECTED` lists."""
+        """Execute an allowed request, in a thread. Raises the errors in `EXPECTED`."""
         link = self._cell_link
         match request:
             case Stop():
@@ -381,7 +382,7 @@ class PageServer:
 
     @property
     def _cell_link(self) -> CellLink:
-        """The link to the cell, where no recording is shown."""
+        """The link to the cell, if no recording is shown."""
         assert self.link.recording is False
         return self.link
 
@@ -436,11 +437,11 @@ class PageServer:
 
 
 async def _send(connection: ServerConnection, page: Page) -> None:
-    """Send what waits for a page, the newest of each slot, and no more before it has read that: it answers a ping.
+    """Send the queued messages of a page, the newest of each slot, and more only after its pong: it has read them.
 
-    Else what a slow page has not read fills the buffers of the sockets, megabytes of pictures: it would show what is
-    long past, and answer too late whether it is there, for which its goal would end. It misses pictures instead; and
-    of what is in no slot what is more than `MAX_WAITING` messages old.
+    Otherwise the messages that a slow page has not read would fill the buffers of the sockets, with megabytes of
+    pictures: the page would show old data, and answer too late to pings, which ends its goal. Instead it misses
+    pictures; and, of messages without a slot, those more than `MAX_WAITING` messages old.
     """
     try:
         while True:
@@ -457,7 +458,7 @@ async def _send(connection: ServerConnection, page: Page) -> None:
 
 
 def _playback(link: RecordedLink, request: PageRequest) -> dict[str, Any]:
-    """Do what a page asks of a recording. Raises RightsError for what would be asked of an arm."""
+    """Execute a page's request on a recording. Raises RightsError for requests to an arm."""
     match request:
         case Play():
             return link.play(request.playing, request.speed)
@@ -471,7 +472,7 @@ def _playback(link: RecordedLink, request: PageRequest) -> dict[str, Any]:
 
 
 def _gone(connection: ServerConnection) -> bytes:
-    """What pages are told of the one that held the arm and is gone."""
+    """Notice to pages that the one that held the arm is closed."""
     lost = connection.close_code == CloseCode.ABNORMAL_CLOSURE
     how = f"lost its connection, or did not answer for {SILENT_S:g} s" if lost else "was closed"
     return msgspec.json.encode(
@@ -499,7 +500,7 @@ def _response(status: HTTPStatus, body: bytes, kind: str = "text/plain; charset=
 
 
 # -- what pages may ask --------------------------------------------------------------------------------------
-# What a page may ask of the server, as strict structs: one JSON object a WebSocket message, with ``do`` and a number
+# Requests of a page to the server, as strict structs: one JSON object per WebSocket message, with ``do`` and a number
 # ``n`` that the answer repeats.
 
 
@@ -521,7 +522,7 @@ class Take(msgspec.Struct, frozen=True, tag="take", tag_field="do", forbid_unkno
 
 
 class Release(msgspec.Struct, frozen=True, tag="release", tag_field="do", forbid_unknown_fields=True):
-    """Hold the arm no longer."""
+    """Release the arm."""
 
     n: Number = 0
 
@@ -551,13 +552,13 @@ class Resume(msgspec.Struct, frozen=True, tag="resume", tag_field="do", forbid_u
 
 
 class Reset(msgspec.Struct, frozen=True, tag="reset", tag_field="do", forbid_unknown_fields=True):
-    """Leave a fault whose cause is gone."""
+    """Leave a fault that no longer has a cause."""
 
     n: Number = 0
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="do", forbid_unknown_fields=True):
-    """Store what the cameras see as goal ``name``."""
+    """Store the current view of the cameras as goal ``name``."""
 
     name: Name
     n: Number = 0
@@ -574,7 +575,7 @@ class Drag(msgspec.Struct, frozen=True, tag="drag", tag_field="do", forbid_unkno
     """Move the outline of the marker body in the picture of ``camera`` by ``shift`` [px] and ``turn`` [rad]; ``nearer``
     multiplies its depth.
 
-    From where the last drag ended (``draft``) or from where the arm is. ``done``: the next drag goes on from here.
+    It starts at the end of the last drag (``draft``) or at the arm's pose. ``done``: the next drag continues from here.
     Nothing moves.
     """
 
@@ -602,14 +603,14 @@ class Go(msgspec.Struct, frozen=True, tag="go", tag_field="do", forbid_unknown_f
 
 
 class Send(msgspec.Struct, frozen=True, tag="send", tag_field="do", forbid_unknown_fields=True):
-    """Send ``goal``, of any kind; its lease is the server's, which renews it while the page is open."""
+    """Send ``goal``, of any kind; the server renews its lease while the page is open."""
 
     goal: Goal
     n: Number = 0
 
 
 class Update(msgspec.Struct, frozen=True, tag="update", tag_field="do", forbid_unknown_fields=True):
-    """Move the set-points of the goal ``id``; ``stamp_s``: the page's own time of them."""
+    """Move the set-points of the goal ``id``; ``stamp_s``: their time by the page's clock."""
 
     id: GoalId
     target: StreamedTarget
@@ -632,7 +633,7 @@ class Play(msgspec.Struct, frozen=True, tag="play", tag_field="do", forbid_unkno
 
 
 class Seek(msgspec.Struct, frozen=True, tag="seek", tag_field="do", forbid_unknown_fields=True):
-    """Of a recording: go to ``at`` [s] after its begin."""
+    """Of a recording: seek to ``at`` [s] after its beginning."""
 
     at: Annotated[float, Meta(ge=0.0, le=1e7)]
     n: Number = 0
@@ -659,9 +660,9 @@ PageRequest = (
     | Seek
 )
 OPEN = (Stop, Take, Release)
-"""What a page may ask that does not hold the arm."""
+"""Requests allowed to a page that does not hold the arm."""
 PLAYBACK = (Play, Seek)
-"""What a page may ask of a recording, and of nothing else."""
+"""Requests allowed only for a recording."""
 
 
 class _Numbered(msgspec.Struct):
@@ -669,13 +670,13 @@ class _Numbered(msgspec.Struct):
 
 
 def decode_request(data: bytes) -> PageRequest:
-    """A page's request. Raises MessageError, whatever the bytes."""
+    """A page's request, decoded. Raises MessageError for any invalid bytes."""
     kind: type[PageRequest] = PageRequest  # type: ignore[assignment]
     return decode(data, kind)
 
 
 def number_of(data: bytes) -> int:
-    """The number of a request that is not valid, which its answer repeats; 0 where it has none."""
+    """The number of an invalid request, which its answer repeats; 0 if it has none."""
     try:
         return msgspec.json.decode(data, type=_Numbered).n
     except Exception:  # bytes of any kind

@@ -162,7 +162,7 @@ def calibrate(
     needed, and nothing moves.
     """
     if rig:
-        from stereoservo.cli.calibrate.rig import RigOptions, calibrate_cameras  # OpenCV and more
+        from stereoservo.cli.calibrate.rig import RigOptions, calibrate_cameras  # imports OpenCV and more
 
         report, text = calibrate_cameras(RigOptions(cell, images, board, pitch, layout, length, seconds, output))
         emit(report, text, json)
@@ -187,7 +187,7 @@ def calibrate(
     if images is not None:
         if lines is not None:
             raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
-        from stereoservo.cli.calibrate.stored_trials import fit_images, source_of_images  # OpenCV and more
+        from stereoservo.cli.calibrate.stored_trials import fit_images, source_of_images  # imports OpenCV and more
 
         from_images = fit_images(cell, images, output)
         emit(from_images, f"{_table(from_images)}\n{source_of_images(from_images)}", json)
@@ -259,14 +259,14 @@ def _table(result: CalibrationResult) -> str:
 
 
 def _failure(error: FailedError, **data: Any) -> CommandError:
-    """Error with its cause's own code and, where the motion ended early, the reasons with their values."""
+    """Error with the cause's own code and, if the motion ended early, the reasons with their values."""
     if error.event.reasons:
         data["reasons"] = msgspec.to_builtins(error.event.reasons)
     return CommandError(error.code, str(error), **data)
 
 
 def _enabled(client: Client, enable: bool) -> None:
-    """See that the drives are on. Raises CommandError where they are off and nobody said to enable them."""
+    """Check that the drives are on. Raises CommandError if they are off and enabling was not requested."""
     if client.status().lifecycle != "inactive":
         return
     if not enable:
@@ -326,7 +326,7 @@ def _lines(what: str) -> Callable[[float, str], None]:
 
 
 def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMessage], None]:
-    """What hands the progress of events, 0 to 1 with its message, to ``tell``, and prints warnings and holds."""
+    """Event handler that passes progress, 0 to 1 with its message, to ``tell``, and prints warnings and holds."""
 
     def progress(event: EventMessage) -> None:
         note_hold(event.kind, event.message, cell)
@@ -345,8 +345,8 @@ def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMe
 
 
 def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: bool) -> None:
-    """Print the report of a check, with earlier checks where they are stored on this host."""
-    from stereoservo.daemon.jobs.check_job import load_checks  # numpy and more
+    """Print the report of a check, with earlier checks if they are stored on this host."""
+    from stereoservo.daemon.jobs.check_job import load_checks  # imports numpy and more
 
     past = load_checks(cell_directories(cell).checks)[0][-SHOWN_CHECKS:] if endpoint is None else [report]
     history = [
@@ -368,8 +368,8 @@ def _print_check(report: CheckReport, cell: str, endpoint: str | None, json: boo
 
 
 def _reset_zeros(client: Client, json: bool) -> None:
-    """Check the model, and reset joint zeros; prints the check in any case. Raises CommandError with the code of
-    the refusal.
+    """Check the model, and reset joint zeros; prints the check in any case. Raises CommandError with the refusal's
+    code.
     """
     checks: list[CheckReport] = []
 

@@ -1,4 +1,4 @@
-"""Calibration of cameras without an arm, for ``stereoservo calibrate --rig``: gathers the views, from live cameras, a
+"""Calibration of cameras without an arm, for ``stereoservo calibrate --rig``: gathers the views from live cameras, a
 recording or folders of pictures, calibrates, and formats the report.
 """
 
@@ -57,7 +57,7 @@ class RigOptions(NamedTuple):
 
 
 class RigReport(msgspec.Struct, frozen=True):
-    """JSON of ``calibrate --rig``: the calibration's fields, the file, and which pictures would help."""
+    """JSON of ``calibrate --rig``: the calibration's fields, the file, and pictures that would improve it."""
 
     rms_px: float
     sigma_px: float
@@ -111,7 +111,7 @@ def _board(text: str, pitch: float | None) -> tuple[int, int] | None:
 
 
 def _layout(options: RigOptions, board: tuple[int, int] | None, ids: tuple[int, ...]) -> FloatArray | None:
-    """Positions (m, 3) [m] of the markers ``ids`` on the body, where they are stated."""
+    """Positions (m, 3) [m] of the markers ``ids`` on the body, if they are stated."""
     if board is not None:
         assert options.pitch is not None
         return np.array([[i % board[0], i // board[0], 0] for i in ids]) * options.pitch
@@ -155,7 +155,7 @@ def _views(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
 
 
 def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
-    """Views of pictures in a folder a camera; those of one place have one name but for the camera's."""
+    """Views of pictures in one folder per camera; pictures of one pose have the same name, apart from the camera's."""
     assert options.images is not None
     folders = sorted(path for path in options.images.glob("*") if path.is_dir())
     pictures = {
@@ -243,7 +243,7 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
 
 
 def _recorded(options: RigOptions) -> RigViews:
-    """Views of a recording of ``record --images``, where the body was held still."""
+    """Views of a recording of ``record --images``, taken while the body was held still."""
     assert options.images is not None
     if not options.cell:
         raise CommandError("argument", f"{options.images} is a recording: its cell file is needed, for the detectors")
@@ -260,7 +260,7 @@ def _recorded(options: RigOptions) -> RigViews:
 
 
 def _live(options: RigOptions) -> RigViews:
-    """Views of a cell file's cameras, watched for some seconds while the body is held here and there."""
+    """Views of a cell file's cameras, observed for some seconds while the body is held in various poses."""
     if not options.cell:
         raise CommandError(
             "argument", "--rig needs a cell file with the cameras, or --images DIR with a folder a camera"
@@ -301,7 +301,7 @@ def _live(options: RigOptions) -> RigViews:
 
 
 def poorly_known(result: RigCalibration) -> list[str]:
-    """What a user of these cameras should not rely on, with its deviation."""
+    """Parameters of these cameras that are too uncertain to rely on, with their standard deviations."""
     found = []
     for camera in result.cameras:
         d = camera.deviations

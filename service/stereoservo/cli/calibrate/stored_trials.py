@@ -1,5 +1,5 @@
 """Calibration from stored trial data for ``stereoservo calibrate CELL --trials FILE.npz``: lenses from a file of
-straight lines, fit, stored model, and what it was made of.
+straight lines, fit, stored model, and its sources.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class StoredFit(CalibrationResult, frozen=True):
 
 
 def source_of_stored(result: StoredFit) -> str:
-    """What a fit of stored trials was made of, and what becomes of it, as lines of text."""
+    """Sources and use of a fit of stored trials, as lines of text."""
     lines = [f"  fitted in {result.seconds:.1f} s"]
     if result.lines is not None:
         used = "; ".join(f"{name}: {', '.join(names)}" for name, names in result.lines.cameras.items())
@@ -68,14 +68,14 @@ def source_of_stored(result: StoredFit) -> str:
 
 
 def fit_stored_trials(cell: str, path: Path, lines: Path | None, lines_sigma: float, output: Path | None) -> StoredFit:
-    """Fit stored trial data in this process; the model is stored beside the cell's others unless ``output`` is
-    given.
+    """Fit stored trial data in this process; the model is stored among the cell's models unless ``output`` is given.
 
-    Beside the others only while no daemon runs: that would keep its model and take this one unasked at its next start.
+    It is stored there only while no daemon runs: a daemon would keep its model, and use this one unrequested at its
+    next start.
 
     Raises CommandError, CalibrationError, ModelFileError, OSError, CellFileError.
     """
-    # scipy and the fit are slow to import; commands that only talk to a daemon do without.
+    # scipy and the fit are slow to import; commands that only talk to a daemon do without them.
     from stereoservo.calibration.fit_assessment import assess_failure
     from stereoservo.calibration.trial_data import CalibrationError, load_trials
     from stereoservo.daemon.jobs.fit_job import fit_trials, report_fit
@@ -119,9 +119,9 @@ def fit_stored_trials(cell: str, path: Path, lines: Path | None, lines_sigma: fl
 
 
 def resolve_cell(cell: str, output: Path | None) -> tuple[CellFile | None, str, Path]:
-    """The cell file, where it was given, the cell's name, and its directory of models.
+    """The cell file, if given, the cell's name, and its directory of models.
 
-    Raises CommandError where a fit could not be kept, CellFileError.
+    Raises CommandError if a fit could not be stored, CellFileError.
     """
     from stereoservo.messages.files import check_writable
 
@@ -160,7 +160,7 @@ def _must_not_run(name: str) -> None:
 
 def _must_fit(file: CellFile, data: Any, path: Path) -> None:
     cameras = [camera.name for camera in file.camera]
-    joints = {limit.joint for limit in file.safety.limit} or set(data.joint_names)  # not stated of a simulated arm
+    joints = {limit.joint for limit in file.safety.limit} or set(data.joint_names)  # not stated for a simulated arm
     if [camera.name for camera in data.cameras] != cameras or set(data.joint_names) != joints:
         raise CommandError(
             "other_cell",
@@ -171,7 +171,7 @@ def _must_fit(file: CellFile, data: Any, path: Path) -> None:
 
 
 def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], LinesUsed]:
-    """Lens of each camera, and the lines it was estimated from: a table ``camera,line,u,v``, with this header.
+    """Lens of each camera, and the lines from which it was estimated: a table ``camera,line,u,v``, with this header.
 
     Raises CommandError naming the row, or the camera whose lines do not determine its lens.
     """
@@ -237,7 +237,7 @@ TELL_EVERY = 500
 
 
 class ImagesUsed(msgspec.Struct, frozen=True):
-    """Images used by a calibration. ``left_out``: rests that were not used, by the reason."""
+    """Images used by a calibration. ``left_out``: number of rests that were not used, by reason."""
 
     directory: str
     stops: int
@@ -253,7 +253,7 @@ class ImageFit(StoredFit, frozen=True):
 
 
 def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
-    """Find the trials in recorded images, keep them beside the images, and fit them.
+    """Find the trials in recorded images, store them beside the images, and fit them.
 
     Raises CommandError, CalibrationError, RecordingError, ImageFileError, DriverError, PluginError, CellFileError.
     """
@@ -287,7 +287,7 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
 
 
 def source_of_images(result: ImageFit) -> str:
-    """What the fit was made of, as lines of text."""
+    """Sources of the fit, as lines of text."""
     used = result.from_images
     what = "" if used is None else f"\n  images {used.directory}: {used.stops} stops, {used.frames} frames"
     return source_of_stored(result) + what
@@ -304,7 +304,7 @@ Progress = Callable[[str, int], None]
 
 @dataclass(frozen=True)
 class RecordedTrials:
-    """Trial data from recorded images; ``left_out``: why rests were not used, with their number; ``frames``
+    """Trial data from recorded images. ``left_out``: number of rests that were not used, by reason; ``frames``
     averaged; ``standing``: static markers.
     """
 
@@ -323,7 +323,7 @@ def flight_recording_of(images: Path) -> Path:
 def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Progress) -> RecordedTrials:
     """Run the cell's detectors on the recorded cameras and average as the trial motions do.
 
-    ``progress`` hears the camera and the number of its frame. Raises CalibrationError (``bad_data``,
+    ``progress`` is called with the camera and the number of its frame. Raises CalibrationError (``bad_data``,
     ``too_few_stops``), RecordingError, ImageFileError, PluginError, DriverError, CellFileError.
     """
     cell = load_cell_file(cell_path)
@@ -371,7 +371,7 @@ def _observations(
 def _settings(cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]) -> CoreSettings:
     """The core's settings for the current cell file, the recorded joints, and the detectors on the recorded cameras."""
     recorded = motion.settings
-    ranges = cell.safety.limit or _recorded_limits(recorded)  # of a simulated arm they may be left out
+    ranges = cell.safety.limit or _recorded_limits(recorded)  # optional for a simulated arm
     limits = {limit.joint: limit for limit in ranges}
     if set(limits) != set(recorded.joint_names):
         raise CalibrationError(
@@ -414,7 +414,8 @@ def _recorded_limits(recorded: CoreSettings) -> tuple[JointLimit, ...]:
 
 
 SAME_POSITION = 4.0
-"""Joints nearer than so many arrival tolerances are in one place: each of two arrivals is within one, and settles."""
+"""Joint positions nearer than this many arrival tolerances are equal: each of two arrivals is within one, and settles.
+"""
 BEFORE_NS = 500_000_000
 
 
@@ -432,8 +433,8 @@ class _Stop:
 class RecordedTrialCollector:
     """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions.
 
-    ``settings``: of the flight, with the cameras and markers of the detectors that are used now. ``left_out``: why
-    rests were not used, with their number.
+    ``settings``: those of the flight, with the cameras and markers of the detectors used now. ``left_out``: number of
+    rests that were not used, by reason.
     """
 
     motion: RecordedMotion
@@ -451,8 +452,8 @@ class RecordedTrialCollector:
         self.used = 0
 
     def wants(self, camera: str, t_ns: int) -> bool:
-        """Whether a frame of this time may be used, or shortly precedes one that is, so that a tracking detector
-        must see it.
+        """Whether a frame of this time may be used, or shortly precedes one that may: a tracking detector must see it,
+        too.
         """
         column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
         newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
@@ -462,7 +463,7 @@ class RecordedTrialCollector:
         )
 
     def add(self, observations: Iterable[CameraObservation]) -> None:
-        """Add one camera's observations in the order of time; those made in motion are skipped."""
+        """Add one camera's observations in order of time; those made in motion are skipped."""
         for observation in observations:
             number = bisect_right(self._settled, observation.t_shutter_ns - 1) - 1
             if number < 0:
@@ -521,8 +522,8 @@ class RecordedTrialCollector:
         self.left_out[why] = self.left_out.get(why, 0) + 1
 
     def _base(self, places: list[FloatArray]) -> FloatArray:
-        """Positions (n,) of the joints that do not move: the cell file's base, or, where most of ``places`` (n,)
-        differ from that in more than one joint, the configuration from which most others differ in one joint.
+        """Positions (n,) of the joints that do not move: the cell file's base; or, if most of ``places`` (n,) differ
+        from it in more than one joint, the configuration from which most others differ in one joint.
         """
         candidates = np.array([self.trial.base, *places])
         away = np.abs(candidates[:, None] - np.array(places)) > SAME_POSITION * self.settings.arrival

@@ -1,7 +1,7 @@
 """Findings of ``stereoservo doctor`` on each camera from its detections and newest frame: sharpness and contrast of
 markers, exposure, frame rate, noise, time between the cameras' shutters.
 
-Pure: records in, findings out. The arm rests meanwhile, or nearly so. Pixels are raw ones.
+Pure functions from records to findings. The arm rests meanwhile, or nearly so. Pixels are raw ones.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ HELD_RATE = 0.95
 STEADY_MARKERS = 0.9
 """Share of frames that must show enough markers."""
 WINDOW_PX = 10
-"""Half the window around a marker that focus and contrast are judged in."""
+"""Half the side of the window around a marker in which focus and contrast are judged."""
 LOW_CONTRAST = 40.0
 """Grey levels between dark and bright below which noise of 2 levels costs a dot more than 0.03 px."""
 WIDE_EDGE_PX = 2.5
-"""Standard deviation of an edge's blur beyond which dots of 10 px are no longer measured well."""
+"""Standard deviation of an edge's blur above which dots of 10 px are no longer measured well."""
 SATURATED = 254
 MUCH_SATURATED = 0.05
 EDGE_PX = 20
-"""Markers nearer to the border of the image than this leave it with the next motion."""
+"""Markers nearer to the border of the image than this leave the image with the next motion."""
 
 
 @dataclass
@@ -46,13 +46,13 @@ class CameraRecord:
     seen: list[CameraObservation] = field(default_factory=list)
     frame: Frame | None = None
     flipped: int = 0
-    """Markers that the detector finds in the mirror image of ``frame``, asked where it finds none in it."""
+    """Markers that the detector finds in the mirror image of ``frame``; searched if it finds none in ``frame``."""
     error: str = ""
     statistics: CameraStatistics | None = None
-    """Counts of the driver over ``watched_s`` [s], where it reports them."""
+    """Counts of the driver over ``watched_s`` [s], if it reports them."""
     watched_s: float = 0.0
     refused: dict[int, str] = field(default_factory=dict)
-    """Why the detector reports no such markers in ``frame``, where it tells; -1: none."""
+    """Reasons why the detector does not report markers in ``frame``, by id, if known; -1: no particular marker."""
 
     @property
     def name(self) -> str:
@@ -90,7 +90,7 @@ def examine_record(record: CameraRecord, min_markers: int) -> Iterator[Examinati
 
 
 def _server_clock(record: CameraRecord) -> list[ExaminationFinding]:
-    """What is known of the clock of a camera's server, where its stamps are used."""
+    """Finding on the clock of a camera's server, if its stamps are used."""
     counted = record.statistics
     if counted is None or counted.server_clock is None:
         return []
@@ -192,7 +192,7 @@ def _markers(record: CameraRecord, min_markers: int) -> ExaminationFinding:
 
 
 def _refused(record: CameraRecord) -> ExaminationFinding:
-    """Why markers are not reported, each reason with those that it is of."""
+    """Reasons why markers are not reported, each with its markers."""
     by_reason: dict[str, list[str]] = {}
     for marker, reason in sorted(record.refused.items()):
         by_reason.setdefault(reason, []).append("" if marker < 0 else str(marker))
@@ -212,7 +212,9 @@ def _scatter(record: CameraRecord) -> str:
 
 
 def marker_scatter(record: CameraRecord) -> float | None:
-    """Standard deviation [px] of a marker's pixels over the frames, the median of the markers; None of few frames."""
+    """Standard deviation [px] of a marker's pixels over the frames, the median of the markers; None if the frames are
+    few.
+    """
     seen: dict[int, list[FloatArray]] = {}
     for observation in record.seen:
         for marker, pixel in zip(observation.ids.tolist(), observation.pixels, strict=True):
@@ -225,7 +227,7 @@ def contrast_and_blur(image: ImageArray, pixel: FloatArray) -> tuple[float, floa
     """Contrast [grey levels], blur of the edges (standard deviation [px]) and share of saturated pixels at a marker.
 
     An edge of contrast c blurred by a Gaussian of s has the largest gradient ``c / (s sqrt(2 pi))``; the central
-    difference widens s² by 1/3. None where the window leaves the image.
+    difference widens s² by 1/3. None if the window is partly outside of the image.
     """
     u, v = np.rint(pixel).astype(int)
     window = image[v - WINDOW_PX : v + WINDOW_PX + 1, u - WINDOW_PX : u + WINDOW_PX + 1]
@@ -269,7 +271,7 @@ def _picture_quality(name: str, image: ImageArray, observation: CameraObservatio
 
 
 def examine_skew(records: Sequence[CameraRecord]) -> Iterator[ExaminationFinding]:
-    """Finding on the time between the cameras' shutters; not a fault, since each image counts at its own time."""
+    """Finding on the time between the cameras' shutters; not a fault, since each image is used at its own time."""
     shown = [record for record in records if len(record.seen) >= 2]
     for first, second in pairwise(shown):
         intervals = first.shutters_ns[:, None] - second.shutters_ns[None, :]

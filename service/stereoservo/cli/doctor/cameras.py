@@ -49,14 +49,14 @@ from stereoservo.ports.devices import (
 
 SAME_REMEDY = "camera.options of one of them: each camera has its own"
 FIRST_FRAME_S = 6.0
-"""How long a camera may take to deliver its first frame."""
+"""Time limit for a camera's first frame [s]."""
 POLL_S = 0.002
 DEFAULT_MARKERS = 4
 GREEN, RED = (0, 200, 0), (0, 0, 230)
 
 
 class WatchedCamera:
-    """An open camera, whose frames are detected in and recorded."""
+    """An open camera, whose frames are searched for markers and recorded."""
 
     def __init__(self, record: CameraRecord, driver: CameraDriver, detector: Detector | None) -> None:
         self.record = record
@@ -66,7 +66,7 @@ class WatchedCamera:
         self._began_s = time.monotonic()
 
     def poll(self) -> None:
-        """Take the frames that arrived; an error ends the observation of this camera, not of the others."""
+        """Process the frames that arrived; an error ends the observation of this camera, not of the others."""
         if self.record.error:
             return
         try:
@@ -76,7 +76,7 @@ class WatchedCamera:
             newest = arrived[-1]
             if isinstance(newest, Frame):
                 self.record.frame = newest
-                assert self._detector is not None  # describe_camera has seen to it
+                assert self._detector is not None  # `describe_camera` has checked it
                 newest = self._detector.detect(newest, None)
             assert isinstance(newest, CameraObservation)
             self.record.seen.append(newest)
@@ -95,7 +95,7 @@ class WatchedCamera:
         return self._driver.statistics() if isinstance(self._driver, CountingCameraDriver) else None
 
     def finish(self) -> None:
-        """Final counts and, where nothing was found, a search in the mirror image. Releases the camera."""
+        """Set the final counts and, if nothing was found, search the mirror image. Releases the camera."""
         now = self._counts()
         if now is not None:
             before = self._began or CameraStatistics()
@@ -124,8 +124,8 @@ class WatchedCamera:
 def examine_cameras(
     plan: RunPlan, settings: CoreSettings, model: CellModel | None, seconds: float, pictures: Path
 ) -> Iterator[ExaminationFinding]:
-    """Findings on the cell's cameras; an image of each is written to ``pictures``. Skipped while another process
-    has them.
+    """Findings on the cell's cameras; an image of each is written to ``pictures``. Skipped while another process uses
+    them.
     """
     directories = plan.directories
     pid = holder(directories.daemon_lock)
@@ -159,9 +159,9 @@ def examine_cameras(
 
 
 def lock_cameras(plan: RunPlan, locks: ExitStack) -> str:
-    """Take the locks of the cell's cameras for as long as ``locks`` lasts; which two are one and the same, else ''.
+    """Take the locks of the cell's cameras as long as ``locks`` lasts; returns which two are the same camera, else ''.
 
-    Raises AlreadyRunningError where another process has one.
+    Raises AlreadyRunningError if another process holds one.
     """
     owners: dict[Path, str] = {}
     for section in plan.cell.camera:
@@ -209,7 +209,7 @@ def watch_cameras(plan: RunPlan, seconds: float) -> list[CameraRecord]:
 
 
 def annotated(image: ImageArray, observation: CameraObservation) -> ImageArray:
-    """The image in colour with the detected markers: circles, ids, standard deviations a hundredfold."""
+    """The image in colour with the detected markers: circles, ids, standard deviations enlarged a hundredfold."""
     picture = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
     for marker, (u, v), C in zip(observation.ids.tolist(), observation.pixels, observation.covariances, strict=True):
         centre = (round(u * 16), round(v * 16))
@@ -252,14 +252,14 @@ def _save_pictures(records: list[CameraRecord], directory: Path) -> Iterator[Exa
 
 
 FITS_PX = 0.5
-"""Root mean square that views of one point may leave before the cameras are reported as moved."""
+"""Largest rms reprojection error of one point's views; above it the cameras are reported as moved."""
 MATCHES = 10
-"""Markers seen by two cameras that the epipolar constraint needs for a test: 7 are used up."""
+"""Markers that two cameras must have in common to test the epipolar constraint: 7 of them determine it."""
 AT_REST_PX = 1.0
-"""Scatter of markers at rest at most: what is compared are means over time."""
+"""Upper bound of the scatter of markers at rest: means over time are compared."""
 WORKSPACE_SHARE = 0.9
 SAME_PX = 0.5
-"""Two cameras that show every marker this close to where the other does are one."""
+"""Two cameras are the same if each shows every marker this close to its position in the other."""
 
 
 def examine_views(records: Sequence[CameraRecord], model: CellModel | None) -> Iterator[ExaminationFinding]:
@@ -293,9 +293,7 @@ def _common(records: Sequence[CameraRecord]) -> tuple[list[int], FloatArray]:
 
 
 def reprojection_rms(cameras: Sequence[CameraModel], pixels: FloatArray) -> float:
-    """Rms reprojection error [px] per coordinate of triangulated points in raw pixels (c, k, 2); NaN without
-    points.
-    """
+    """Rms reprojection error [px] per coordinate of triangulated points in raw pixels (c, k, 2); NaN if none."""
     Ps = np.array([camera.matrix for camera in cameras])
     ideal = np.array([undistort(camera.lens, p) for camera, p in zip(cameras, pixels, strict=True)])
     points = triangulate(Ps, ideal)
@@ -366,7 +364,7 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
 
 
 def same_camera_twice(records: Sequence[CameraRecord], pixels: float = SAME_PX) -> ExaminationFinding | None:
-    """Finding on two cameras that show one picture: every marker within ``pixels`` [px] of the other's."""
+    """Finding on two cameras that show the same picture: every marker within ``pixels`` [px] of the other's."""
     for k, first in enumerate(records):
         for second in records[k + 1 :]:
             ids, at, _ = mean_observations(first)

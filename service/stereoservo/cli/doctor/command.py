@@ -72,10 +72,10 @@ def doctor(
 
 
 def examine_cell(path: Path, may_move: MayMove, seconds: float, pictures: Path | None) -> Iterator[ExaminationFinding]:
-    """Findings on a cell, each as soon as it is known: its file, this computer, drives, cameras.
+    """Findings on a cell, each as soon as it is available: its file, this computer, drives, cameras.
 
-    ``seconds``: how long the cameras are watched; 0: not at all. Raises CellFileError, PluginError, DriverError where
-    the file cannot be used.
+    ``seconds``: duration of observing the cameras; 0: not at all. Raises CellFileError, PluginError, DriverError if the
+    file cannot be used.
     """
     plan, directories = yield from examine_file(path)
     yield from examine_joints(plan, may_move)
@@ -101,7 +101,7 @@ def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPla
 def examine_pictures(
     plan: RunPlan, directories: CellDirectories, seconds: float, pictures: Path | None = None
 ) -> Generator[ExaminationFinding, None, None]:
-    """Findings on the cameras, watched for ``seconds``; ``pictures``: directory for what they see."""
+    """Findings on the cameras, observed for ``seconds``; ``pictures``: directory for annotated images."""
     settings = plan.settings()
     model, _ = ModelStore(directories.models).newest_fitting(settings)
     yield from examine_cameras(plan, settings, model, seconds, pictures or directories.state / "doctor")
@@ -142,7 +142,7 @@ def _rates(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
 
 
 def _camera_count(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
-    """Finding on the number of cameras: one alone tells nothing of depth, so that no model can be learnt."""
+    """Finding on the number of cameras: a single camera does not observe depth, so no model can be learnt."""
     count = len(plan.cell.camera)
     if count > 1:
         return ExaminationFinding("camera count", True, f"{count} cameras")

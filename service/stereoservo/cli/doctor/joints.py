@@ -1,4 +1,4 @@
-"""Examination of the arm by its joint driver for ``stereoservo doctor``, which moves a joint only with the user's
+"""Examination of the arm through its joint driver for ``stereoservo doctor``, which moves a joint only with the user's
 permission.
 """
 
@@ -30,7 +30,7 @@ from stereoservo.ports.devices import (
 
 
 def permission(jog: bool, yes: bool) -> MayMove:
-    """Function that permits the examination to move a joint: never, always (``--yes``), or as the user answers.
+    """Function that permits the examination to move a joint: never, always (``--yes``), or by the user's answer.
 
     Raises CommandError without a terminal to ask on.
     """
@@ -49,8 +49,8 @@ def permission(jog: bool, yes: bool) -> MayMove:
 
 
 def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFinding]:
-    """Findings on the cell's arm: by its driver where that can examine it, else on its samples. Nothing is accessed
-    while another process has the hardware.
+    """Findings on the cell's arm: by its driver if that can examine it, else from its samples. Nothing is accessed
+    while another process uses the hardware.
     """
     clock = MonotonicClock()
     driver = make_driver(plan, clock)
@@ -68,20 +68,20 @@ def examine_joints(plan: RunPlan, may_move: MayMove) -> Iterator[ExaminationFind
         except AlreadyRunningError as error:
             yield ExaminationFinding("drives", None, f"not examined: {error}")
             return
-        # As the servo process is scheduled, so that what is measured is what it would see; where that is not allowed,
-        # the check "scheduling" says so.
+        # Scheduled like the servo process, so that the measured timing is the same as there; if that is not allowed,
+        # the check "scheduling" reports it.
         locks.enter_context(realtime_for_a_while(plan.cell.servo.priority))
         try:
             if isinstance(driver, ExaminableJointDriver):
                 yield from driver.examine(may_move)
             else:
                 yield from examine_samples(plan, driver, clock)
-        except DriverError as error:  # `latched`: a fault that came up meanwhile, and only a reset ends
+        except DriverError as error:  # `latched`: a fault that occurred meanwhile, and that only a reset ends
             yield ExaminationFinding("fault" if error.data.get("latched") else "drives", False, str(error))
 
 
 # -- by its samples ------------------------------------------------------------------------------------------
-# Examination of an arm whose joint driver cannot examine it: connected, read for a moment, closed; nothing moves.
+# Examination of an arm whose joint driver cannot examine it: connected, read for a short time, closed; nothing moves.
 
 
 SAMPLED_S = 0.3
@@ -94,7 +94,7 @@ NOT_LOOKED_AT = (
 def examine_samples(plan: RunPlan, driver: JointDriver, clock: Clock) -> Iterator[ExaminationFinding]:
     """Findings on a driver's joint samples: shape, finite values, limits, stamps. Configures and closes the driver.
 
-    Never raises on what the driver does: a failure is a finding.
+    Never raises whatever the driver does: a failure is a finding.
     """
     name = plan.joints.driver
     if plan.joints.simulated:
@@ -128,7 +128,7 @@ def _raised(name: str, call: str, error: Exception) -> str:
 
 
 def _values(plan: RunPlan, states: list[JointState]) -> ExaminationFinding:
-    """Finding on the newest positions: as many as joints, finite, within the cell's limits."""
+    """Finding on the newest positions: number of joints, finite values, within the cell's limits."""
     names = [joint.name for joint in plan.joints.joints]
     newest = states[-1]
     for what, values in (("positions", newest.positions), ("velocities", newest.velocities)):

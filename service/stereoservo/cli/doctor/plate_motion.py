@@ -1,8 +1,8 @@
-"""What pictures of printed faces tell before anything is calibrated: by how much the plate was turned between two
-looks, and on which side of one another two cameras stand.
+"""Findings from pictures of printed faces before any calibration: the angle by which the plate was turned between two
+sets of pictures, and on which side of each other two cameras are.
 
-Pure: pixels in, findings out. A face's pattern is known up to its size, and nothing is needed of a camera: its focal
-length is the one by which the faces look least bent, and small rotations hardly depend on it.
+Pure functions from pixels to findings. The size of a face's pattern is not needed, and neither are camera parameters:
+the focal length is the one with the least misfit of flat faces, and small rotations hardly depend on it.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from stereoservo.ports.devices import ExaminationFinding
 from stereoservo.ports.dot_plates import FACES
 
 LEAST_DOTS = 5
-"""Dots of a face that fix its pose."""
+"""Least number of dots that determine a face's pose."""
 FOCAL_LENGTHS = np.geomspace(0.6, 3.0, 25)
 """[widths of a picture] of lenses that are tried."""
 USUAL_FOCAL, FOCAL_SPREAD = 1.1, 0.5
-"""[widths], and natural logarithm: what is expected before the pictures are asked."""
+"""Prior of the focal length: [widths], and standard deviation of its natural logarithm."""
 LEAST_SIGMA_PX = 0.01
 AGREES = 0.15
-"""Share by which pictures and encoder may differ: perspective of an unknown lens, play, a shaken table."""
+"""Relative tolerance between pictures and encoder: perspective of an unknown lens, play, a shaken table."""
 SIGMAS = 3.5
 UNSEEN = 0.5
-"""Of a motion, the deviation beyond which its pictures say nothing."""
+"""Relative standard deviation of a motion above which its pictures are not significant."""
 SIDES = ("left", "right")
 
 View = tuple[FloatArray, FloatArray, float]
@@ -39,8 +39,8 @@ View = tuple[FloatArray, FloatArray, float]
 
 @dataclass(frozen=True)
 class Turn:
-    """A rotation that pictures show: ``angle`` [rad] with its deviation, and the shift of the markers (2,) [px] in the
-    camera that shows it best.
+    """A rotation seen in pictures: ``angle`` [rad] with its standard deviation, and the shift of the markers (2,) [px]
+    in the camera that shows it best.
     """
 
     angle: float
@@ -50,7 +50,7 @@ class Turn:
 
 
 def faces_in(record: CameraRecord) -> dict[str, tuple[list[int], FloatArray, FloatArray, float]]:
-    """Known faces that a camera sees: by name the ids, pattern (k, 3), mean pixels (k, 2) and their deviation [px]."""
+    """Faces seen by a camera: by name ids, pattern (k, 3), mean pixels (k, 2) and their standard deviation [px]."""
     ids, pixels, sigmas = mean_observations(record)
     place = {int(marker): k for k, marker in enumerate(ids)}
     found = {}
@@ -66,14 +66,16 @@ def faces_in(record: CameraRecord) -> dict[str, tuple[list[int], FloatArray, Flo
 
 
 def intrinsics(width: int, height: int, focal: float) -> FloatArray:
-    """Matrix (3, 3) of a camera of focal length ``focal`` [widths] that looks through the middle of its picture."""
+    """Matrix (3, 3) of a camera of focal length ``focal`` [widths] with its principal point at the centre of its
+    picture.
+    """
     f = focal * width
     return np.array([[f, 0.0, 0.5 * (width - 1)], [0.0, f, 0.5 * (height - 1)], [0.0, 0.0, 1.0]])
 
 
 def poses(pattern: FloatArray, pixels: FloatArray, K: FloatArray) -> list[tuple[float, FloatArray, FloatArray]]:
-    """Poses of a plane pattern (k, 3) from its pixels (k, 2), best first: rms [px], rotation vector (3,), translation
-    (3,); two that a distant plane cannot tell apart, or none.
+    """Poses of a planar pattern (k, 3) from its pixels (k, 2), best first: rms [px], rotation vector (3,), translation
+    (3,). Two if the plane is too distant to distinguish them, or none.
     """
     try:
         _, rotations, translations, _ = cv2.solvePnPGeneric(
@@ -92,8 +94,8 @@ def poses(pattern: FloatArray, pixels: FloatArray, K: FloatArray) -> list[tuple[
 def refined_pose(
     pattern: FloatArray, pixels: FloatArray, K: FloatArray, r: FloatArray, t: FloatArray
 ) -> tuple[float, FloatArray, FloatArray] | None:
-    """The pose of least squares from a first one: rms [px], rotation vector (3,), translation (3,); None behind the
-    camera.
+    """The least-squares pose, refined from an initial one: rms [px], rotation vector (3,), translation (3,); None if it
+    is behind the camera.
     """
     try:
         r, t = cv2.solvePnPRefineLM(pattern, np.ascontiguousarray(pixels), K, None, r.copy(), t.copy())
@@ -106,7 +108,7 @@ def refined_pose(
 
 
 def focal_length(width: int, height: int, views: Sequence[View]) -> float:
-    """The focal length [widths] by which faces, one view each, are seen as the flat patterns that they are."""
+    """The focal length [widths] with the least misfit of flat faces, one view each."""
 
     def cost(focal: float) -> float:
         K = intrinsics(width, height, focal)
@@ -120,7 +122,7 @@ def focal_length(width: int, height: int, views: Sequence[View]) -> float:
 
 
 def _rotation_between(K: FloatArray, before: View, after: View) -> tuple[FloatArray, FloatArray] | None:
-    """Rotation vector (3,) of a face between two pictures in the camera's frame, and its information (3, 3)."""
+    """Rotation vector (3,) of a face between two pictures in the camera's frame, and its information matrix (3, 3)."""
     first = poses(before[0], before[1], K)
     if not first:
         return None
@@ -131,7 +133,7 @@ def _rotation_between(K: FloatArray, before: View, after: View) -> tuple[FloatAr
     r1 = second[1]
     R0, R1 = cv2.Rodrigues(r0)[0], cv2.Rodrigues(r1)[0]
     turned = cv2.Rodrigues(R1 @ R0.T)[0].reshape(3)
-    # In the frame of the camera: a small turn w after the pose changes X by w x (X - t).
+    # In the camera's frame: a small turn w after the pose changes X by w x (X - t).
     X = before[0] @ R0.T + t0
     f = K[0, 0]
     rows = []
@@ -147,9 +149,9 @@ def _rotation_between(K: FloatArray, before: View, after: View) -> tuple[FloatAr
 
 
 def turn_between(before: Sequence[CameraRecord], after: Sequence[CameraRecord]) -> Turn | None:
-    """By how much the faces were turned between two looks of the same cameras; None where none shows a face in both.
+    """Rotation of the faces between two sets of pictures of the same cameras; None if no camera sees a face in both.
 
-    The rotation of a body is the same about whatever point, and its angle the same for all cameras.
+    The rotation of a body is the same about any point, and its angle is the same for all cameras.
     """
     weights, angles, shown = [], [], []
     for first, second in zip(before, after, strict=True):
@@ -180,7 +182,7 @@ def turn_between(before: Sequence[CameraRecord], after: Sequence[CameraRecord]) 
 
 
 def judge_turn(joint: str, travel: float, turn: Turn | None) -> ExaminationFinding:
-    """Finding on a revolute joint's ``travel`` [rad] by its encoder against what the pictures saw."""
+    """Finding on a revolute joint's ``travel`` [rad] by its encoder, compared with the rotation in the pictures."""
     name = f"{joint} pictures"
     told = f"{math.degrees(abs(travel)):.3f}°"
     if turn is None:
@@ -228,9 +230,9 @@ def _direction(shift: FloatArray) -> str:
 
 
 def examine_sides(records: Sequence[CameraRecord]) -> ExaminationFinding | None:
-    """Finding on two cameras that are named after their sides; None where they are not, or no face is seen by both.
+    """Finding on two cameras that are named after their sides; None if they are not, or no face is seen by both.
 
-    Of a face's two poses that a distant camera cannot tell apart, all that explain the pictures must agree.
+    Of a face's two poses that a distant camera cannot distinguish, all that explain the pictures must agree.
     """
     named = {side: record for side in SIDES for record in records if side in record.name.lower()}
     if len(named) < 2 or named["left"] is named["right"]:
@@ -253,8 +255,8 @@ def examine_sides(records: Sequence[CameraRecord]) -> ExaminationFinding | None:
 
 
 def side_offsets(left: CameraRecord, right: CameraRecord) -> list[float]:
-    """How far the right camera stands to the right of the left one, in shares of the plate's distance, by each face and
-    each pair of poses that explain it; empty where none is seen by both.
+    """Displacement of the right camera to the right of the left one, relative to the plate's distance, for each face
+    and each pair of poses that explains it; empty if none is seen by both.
     """
     offsets = []
     views = [faces_in(record) for record in (left, right)]

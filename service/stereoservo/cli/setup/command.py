@@ -1,7 +1,7 @@
-"""Command ``stereoservo setup``: from a box of hardware to the first goal, guided in the terminal.
+"""Command ``stereoservo setup``: from unknown hardware to the first goal, guided in the terminal.
 
-Each step checks itself. What it continues from, when it is run again, is the cell file, the models and taught goals of
-the cell, and the note that its joints were commissioned as the file has them.
+Each step checks itself. When it is run again it continues from the cell file, the models and taught goals of the cell,
+and the record that its joints were commissioned with this file.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def setup(
 
 
 def _steps(file: Path, dialogue: Dialogue, extra: dict[str, Any]) -> dict[str, Any]:
-    """All steps; returns what the command's JSON holds. Raises CommandError and what the steps raise."""
+    """All steps; returns the command's JSON. Raises CommandError and the errors of the steps."""
     dialogue.say(
         f"Setting up {file}. Ctrl-C ends it at any time, and stops the arm; the same command goes on from there.\n"
         "This is no safety function: an emergency stop that takes the drives' power away comes before all of it."
@@ -127,9 +127,9 @@ def _steps(file: Path, dialogue: Dialogue, extra: dict[str, Any]) -> dict[str, A
 def _commissioned(
     plan: RunPlan, directories: CellDirectories, dialogue: Dialogue, findings: list[ExaminationFinding]
 ) -> None:
-    """Look at cameras and drives, and move each joint for the first time, unless that was done with this cell file.
+    """Check cameras and drives, and move each joint for the first time, unless that was done with this cell file.
 
-    Raises CommandError where nothing is wrong and not every joint was moved.
+    Raises CommandError if no check failed and yet not every joint was moved.
     """
     sound: list[bool] = [not _failed(findings)]
     _all(examine_pictures(plan, directories, WATCH_S), dialogue, findings, sound)
@@ -166,7 +166,7 @@ def _commissioned(
 
 
 def _examined(file: Path, dialogue: Dialogue, findings: list[ExaminationFinding]) -> tuple[RunPlan, CellDirectories]:
-    """The plan of the cell, with the findings on file and computer told."""
+    """The plan of the cell; findings on file and computer are printed."""
     examination = examine_file(file)
     with dialogue.doing("loading drivers and detectors"):
         while True:
@@ -185,7 +185,7 @@ def _examined(file: Path, dialogue: Dialogue, findings: list[ExaminationFinding]
 
 
 def bus_findings(cell: CellFile) -> tuple[ExaminationFinding, ...]:
-    """Findings on the bus that a cell file names, whose further options its driver refuses: what may be behind that."""
+    """Findings on the bus of a cell file whose other options its driver refuses: possible causes."""
     finder = plugins.load(plugins.JOINT_DRIVERS, cell.joints.driver)
     if not isinstance(finder, DriveFinder):
         return ()
@@ -201,7 +201,7 @@ def _all(
     findings: list[ExaminationFinding],
     sound: list[bool],
 ) -> None:
-    """Tell findings as they come."""
+    """Print findings as they come."""
     with dialogue.doing("checking"), closing(found):
         for finding in found:
             findings.append(finding)
@@ -214,7 +214,7 @@ def _failed(findings: list[ExaminationFinding]) -> list[ExaminationFinding]:
 
 
 def _stop_where_failed(findings: list[ExaminationFinding], dialogue: Dialogue, file: Path) -> None:
-    """Raise CommandError with everything that was found wrong, and what to do."""
+    """Raise CommandError with all failed findings, and their remedies."""
     failed = _failed(findings)
     if not failed:
         return
@@ -230,13 +230,13 @@ def _stop_where_failed(findings: list[ExaminationFinding], dialogue: Dialogue, f
 
 
 def commissioning_mark(cell: CellFile) -> str:
-    """What of a cell file a commissioning is good for: its drives and their options, its cameras."""
+    """Hash of the parts of a cell file for which a commissioning is valid: drives with options, and cameras."""
     told = msgspec.json.encode([cell.joints, cell.camera], enc_hook=str, order="sorted")
     return hashlib.sha256(told).hexdigest()
 
 
 def _keep_answers(file: Path, dialogue: Dialogue) -> None:
-    """Write the answers down, to be repeated by --answers."""
+    """Write the answers to a file, for --answers."""
     if dialogue.asked:
         directories = cell_directories(file.stem)
         create_directories(directories)
@@ -246,21 +246,21 @@ def _keep_answers(file: Path, dialogue: Dialogue) -> None:
 
 
 # -- commissioning -------------------------------------------------------------------------------------------
-# Commissioning, joint by joint: each is moved by less than a degree, and three witnesses are compared: what its
-# encoder told, what the pictures saw, and what the person says moved.
+# Commissioning, joint by joint: each is moved by less than a degree, and three sources are compared: the encoder, the
+# pictures, and the joint that the person saw moving.
 
 
 SHARE = 0.45
-"""Of one degree: a gear ratio that is wrong by two moves the joint by less than one."""
+"""Share of one degree: with a gear ratio that is wrong by a factor of two the joint still moves by less than one."""
 FRAMES = 24
-"""Pictures of a look; their mean is what noise leaves."""
+"""Pictures of an observation, averaged to reduce noise."""
 LOOK_S = 4.0
 POLL_S = 0.002
 EYE = re.compile(r"(?P<joint>\S+?)(?P<sense>[+-]?)")
 
 
 class Cameras:
-    """The cell's cameras, open, to look at the plate before and after a motion. A context manager."""
+    """The cell's cameras, open, to observe the plate before and after a motion. A context manager."""
 
     def __init__(self, plan: RunPlan) -> None:
         self._plan = plan
@@ -285,7 +285,7 @@ class Cameras:
             camera.finish()
 
     def look(self) -> list[CameraRecord]:
-        """What each camera sees from now on, in ``FRAMES`` pictures taken from now, or as many as come."""
+        """Observations of each camera from now on, of ``FRAMES`` new pictures, or as many as arrive."""
         begun_ns = self._clock.now_ns()
         until_ns = begun_ns + round(LOOK_S * 1e9)
         for camera in self._watched:
@@ -310,10 +310,10 @@ class Cameras:
 def commission(
     plan: RunPlan, dialogue: Dialogue, sound: Sequence[bool], names: Sequence[str]
 ) -> Generator[ExaminationFinding, None, None]:
-    """Findings on the drives, then on each joint's first motion, which the person permits once, and nobody where
-    something was found wrong before. ``sound``: whether all findings so far are; it grows with those that come.
+    """Findings on the drives, then on each joint's first motion. The person permits the motions once; none is made
+    after a failed finding. ``sound``: results of all findings so far; new ones are appended meanwhile.
 
-    ``names``: of the joints, base first.
+    ``names``: names of the joints, base first.
     """
     asked: list[bool] = []
     before: list[CameraRecord] = []
@@ -352,16 +352,16 @@ def commission(
 
 
 def in_fault(findings: Sequence[ExaminationFinding]) -> ExaminationFinding | None:
-    """The finding that drives stand in a fault, which only a reset ends; None where they do not."""
+    """The finding that drives are in a fault, which only a reset ends; None if they are not."""
     return next((finding for finding in findings if finding.name == "fault" and finding.ok is False), None)
 
 
 def reset_drives(plan: RunPlan) -> None:
-    """Clear the drives' faults; nothing is enabled. Raises DriverError where one stays."""
+    """Clear the drives' faults; nothing is enabled. Raises DriverError if one remains."""
     driver = make_driver(plan, MonotonicClock())
     try:
         driver.configure()
-        driver.configure()  # the first call reports what it finds, the next one clears it
+        driver.configure()  # the first call reports it, the next one clears it
     finally:
         driver.close()
 
@@ -378,7 +378,7 @@ def seen_by_pictures(
 
 
 def asked_of_a_person(dialogue: Dialogue, jogged: tuple[str, float], names: Sequence[str]) -> ExaminationFinding:
-    """Finding on a jog by what a person saw."""
+    """Finding on a jog by the person's observation."""
     joint, travel = jogged
     wanted = f"{joint}{'+' if travel > 0 else '-'}"
     answer = dialogue.ask(
@@ -391,7 +391,7 @@ def asked_of_a_person(dialogue: Dialogue, jogged: tuple[str, float], names: Sequ
 
 
 def _eye(text: str, names: Sequence[str]) -> tuple[str, str]:
-    """Parse what a person saw move: joint and sense. Raises ValueError."""
+    """Parse the motion that a person saw: joint and sense. Raises ValueError."""
     if text.lower() in ("nothing", "none"):
         return "", ""
     match = EYE.fullmatch(text)
@@ -401,7 +401,7 @@ def _eye(text: str, names: Sequence[str]) -> tuple[str, str]:
 
 
 def eye_finding(joint: str, travel: float, answer: tuple[str, str]) -> ExaminationFinding:
-    """Finding on what a person saw move while ``joint`` was driven by ``travel`` [rad or m]."""
+    """Finding on the motion that a person saw while ``joint`` was driven by ``travel`` [rad or m]."""
     name = f"{joint} seen"
     moved, sense = answer
     expected = "+" if travel > 0 else "-"
@@ -427,21 +427,21 @@ def eye_finding(joint: str, travel: float, answer: tuple[str, str]) -> Examinati
 
 
 # -- the first goal ------------------------------------------------------------------------------------------
-# The last steps of `stereoservo setup`: the daemon, a calibration, the first taught goal, and the way back to it.
+# The last steps of `stereoservo setup`: the daemon, a calibration, the first taught goal, and the return to it.
 
 
 AWAY_SHARE = 0.3
-"""Of a joint's trial motion, how far the arm is sent away from its first goal; and in any case no more than"""
+"""Displacement from the first goal as a share of a joint's trial motion, limited by `AWAY_MOST`."""
 AWAY_MOST = {"revolute": 0.15, "prismatic": 0.05}
-"""[rad or m]"""
+"""[rad or m] Largest displacement of a joint."""
 GOAL_S = 180.0
 
 
 @contextmanager
 def running(file: Path, directories: CellDirectories, dialogue: Dialogue) -> Iterator[Client]:
-    """A client of the cell's daemon, which is started, for the time of it, where none runs.
+    """A client of the cell's daemon, which is started, for this context only, if none runs.
 
-    Raises CommandError where it does not start; Ctrl-C stops the arm.
+    Raises CommandError if it does not start; Ctrl-C stops the arm.
     """
     daemon: DaemonProcess | None = None
     try:
@@ -470,7 +470,7 @@ def running(file: Path, directories: CellDirectories, dialogue: Dialogue) -> Ite
 
 
 def calibrated(client: Client, dialogue: Dialogue) -> dict[str, Any]:
-    """Calibrate the cell; returns what a report's summary holds. Raises ClientError, CommandError."""
+    """Calibrate the cell; returns the summary of the report. Raises ClientError, CommandError."""
 
     def progress(event: EventMessage) -> None:
         if event.kind == "warning":
@@ -497,7 +497,7 @@ def calibrated(client: Client, dialogue: Dialogue) -> dict[str, Any]:
 
 
 def first_goal(client: Client, directories: CellDirectories, dialogue: Dialogue) -> dict[str, Any]:
-    """Teach a goal where the arm stands, send the arm away and back to it by the pictures. Raises ClientError."""
+    """Teach a goal at the arm's pose, send the arm away and back to it by the pictures. Raises ClientError."""
     known = load_taught(directories.taught)
     name = dialogue.ask("goal", "A name for the goal that the cameras see now", next(iter(known), "first"), _goal_name)
     if name not in known:
@@ -523,7 +523,7 @@ def _goal_name(text: str) -> str:
 
 
 def away(client: Client) -> dict[str, float]:
-    """Joint positions [rad or m] a little off the present ones, each joint towards the middle of its range."""
+    """Joint positions [rad or m] near the current ones, each joint displaced towards the centre of its range."""
     info, joints = client.info(), client.joints()
     targets = {}
     for joint in info.joints:
@@ -534,7 +534,7 @@ def away(client: Client) -> dict[str, float]:
 
 
 def arm_is_off(client: Client) -> bool:
-    """Whether the drives are off and the arm can be enabled. Raises ClientError where the cell is in a fault."""
+    """Whether the drives are off and the arm can be enabled. Raises ClientError if the cell is in a fault."""
     state = client.status()
     if state.lifecycle == "fault":
         raise ClientError("the cell is in a fault: " + "; ".join(reason.hint for reason in state.reasons))

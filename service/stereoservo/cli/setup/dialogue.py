@@ -1,5 +1,5 @@
-"""Dialogue of `stereoservo setup` with a person: lines as things happen, questions with defaults, answers that may come
-from a file and are written down, so that the whole can be repeated.
+"""Dialogue of `stereoservo setup` with a person: progress lines, questions with defaults, and answers that may be read
+from a file and are stored, so that the whole dialogue can be repeated.
 """
 
 from __future__ import annotations
@@ -17,16 +17,19 @@ from typing import TextIO, TypeVar
 from stereoservo.cli.output import CommandError
 
 QUIET_S = 1.5
-"""After so long without a line, what is under way is told again: a person takes 3 s of silence for the end."""
+"""Time without output after which the current activity is printed again: after 3 s of silence a person assumes the end.
+"""
 _LOOK_S = 0.2
 T = TypeVar("T")
 
 
 class Dialogue:
-    """Lines and questions. ``answers``: by the question's key; what they lack is asked on a terminal, or its default
-    where there is none; None: all are typed. A context manager.
+    """Output lines and questions. A context manager.
 
-    ``asked``: questions and their answers so far. ``longest_silence_s``: between two lines, waits for a person aside.
+    ``answers``: by the question's key; missing ones are asked on a terminal, or have their default if there is none.
+    None: all are typed.
+    ``asked``: questions and their answers so far.
+    ``longest_silence_s``: longest time between two lines, without waiting for a person.
     """
 
     def __init__(self, out: TextIO, answers: dict[str, str] | None = None) -> None:
@@ -50,17 +53,17 @@ class Dialogue:
         self._ticker.join()
 
     def say(self, line: str) -> None:
-        """One line, or more."""
+        """Print one line, or more."""
         with self._lock:
             self._write(line)
 
     def heading(self, line: str) -> None:
-        """The beginning of a step."""
+        """Print the heading of a step."""
         self.say(f"\n== {line}")
 
     @contextmanager
     def doing(self, what: str) -> Iterator[None]:
-        """Something that may take long: told again and again while nothing else is said."""
+        """Context manager of an activity that may take long: printed repeatedly while there is no other output."""
         before = self._doing, self._since_s
         self._doing, self._since_s = what, time.monotonic()
         try:
@@ -69,7 +72,7 @@ class Dialogue:
             self._doing, self._since_s = before
 
     def now(self, what: str) -> None:
-        """What is under way from now on, in place of what was."""
+        """Replace the current activity."""
         self._doing = what
 
     def ask(
@@ -80,10 +83,10 @@ class Dialogue:
         parse: Callable[[str], T],
         shown: Callable[[str], str] = str,
     ) -> T:
-        """The answer to a question, as ``parse`` understands it, which raises ValueError with what would be valid.
+        """The answer to a question, parsed by ``parse``, which raises ValueError with the valid values.
 
-        ``default``: what an empty answer means; ``shown``: an answer as it is told again. Raises CommandError: no
-        terminal and no answer, a scripted answer that is not valid.
+        ``default``: meaning of an empty answer; ``shown``: the form in which an answer is printed. Raises CommandError:
+        no terminal and no answer, a scripted answer that is not valid.
         """
         prompt = f"{question}{'' if default is None else f' [{default}]'}: "
         while True:
@@ -103,7 +106,7 @@ class Dialogue:
         return self.ask(key, f"{question} (yes or no)", "yes" if default else "no", _yes_or_no)
 
     def _scripted(self, key: str) -> bool:
-        """Whether a question is answered by the answers that were given, and what they lack by its default."""
+        """Whether a question is answered by the given answers, or by its default if they lack it."""
         return self._answers is not None and (key in self._answers or not sys.stdin.isatty())
 
     def _answer(self, key: str, prompt: str, default: str | None, shown: Callable[[str], str]) -> str:

@@ -1,5 +1,5 @@
-"""Interview of `stereoservo setup`: what is found on this computer, what only a person knows, and the cell file made of
-both.
+"""Interview of `stereoservo setup`: collects the hardware found on this computer and the facts only a person has, and
+writes the cell file from both.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ JOINT_DRIVER, CAMERA_DRIVER, DETECTOR = "canopen", "video", "dots"
 COUNTS = 65536.0
 SPEED_DEG = 20.0
 AROUND_DEG = 40.0
-"""Proposed where a drive has no limits: so far to both sides of where the joint stands."""
+"""Proposed range to both sides of the joint's position, if a drive has no limits."""
 MARGIN = 5.0
-"""[degrees or mm] The arm begins its trial motions where it stands: so far from every limit at least."""
+"""[degrees or mm] Least distance of every limit from the arm's position, where it starts its trial motions."""
 NAMES = ("left", "right")
 _NEXT_CAMERA = re.compile(r"[\s,]+(?=[A-Za-z][A-Za-z0-9+.-]*://|/dev/|[0-9]+(?:[\s,]|$))")
 
@@ -131,7 +131,7 @@ def chosen_cameras(text: str, found: Sequence[FoundCamera]) -> list[FoundCamera]
 
 
 def _camera_words(text: str) -> list[str]:
-    """Numbers and addresses of an answer; blanks and commas in a password part nothing."""
+    """Numbers and addresses of an answer; blanks and commas in a password do not separate."""
     return [word for word in _NEXT_CAMERA.split(text.strip(" \t,")) if word]
 
 
@@ -238,7 +238,7 @@ def _joints(dialogue: Dialogue, scan: BusScan) -> list[JointChoice]:
 
 
 def chosen_order(text: str, drives: dict[int, FoundDrive]) -> list[tuple[FoundDrive, bool]]:
-    """Parse node ids, base first, and which are slides. Raises ValueError."""
+    """Parse node ids, base first, and which of them are prismatic. Raises ValueError."""
     order = []
     for word in text.replace(",", " ").split():
         number = word.removesuffix("p")
@@ -265,7 +265,7 @@ def numbers(text: str, count: int, *, positive: bool = False) -> list[float]:
 
 
 def velocity_units(text: str, count: int) -> list[float | None]:
-    """Parse ``counts`` or numbers, one for all or each. Raises ValueError."""
+    """Parse ``counts`` or numbers, one for all or one for each. Raises ValueError."""
     words = text.replace(",", " ").split()
     if len(words) not in (1, count):
         raise ValueError(f"one, or {count} by spaces: counts, or a number")
@@ -274,12 +274,12 @@ def velocity_units(text: str, count: int) -> list[float | None]:
 
 
 def unit(joint: JointChoice) -> float:
-    """What a person's degree or millimetre is of a joint [rad or m]."""
+    """A person's unit of a joint, degree or millimetre, in [rad or m]."""
     return math.radians(1.0) if joint.kind == "revolute" else 1e-3
 
 
 def joint_position(joint: JointChoice, counts: int | None = None) -> float:
-    """Position [rad or m] of a joint at ``counts`` of its drive, or where it stood when it was found."""
+    """Position [rad or m] of a joint at ``counts`` of its drive, or at the counts when it was found."""
     at = joint.drive.position or 0 if counts is None else counts
     turns = at / (joint.counts_per_rev * joint.gear_ratio)
     return turns * 2.0 * math.pi if joint.kind == "revolute" else turns
@@ -291,7 +291,7 @@ def _range_text(joint: JointChoice) -> str:
 
 
 def proposed_range(joint: JointChoice) -> tuple[float, float]:
-    """The drive's own limits [rad or m]; where it has none, some way to both sides of where the joint stands."""
+    """The drive's own limits [rad or m]; if it has none, a range to both sides of the joint's position."""
     limits = joint.drive.limits
     if limits is not None:
         low, high = (joint_position(joint, counts) for counts in limits)
@@ -301,7 +301,7 @@ def proposed_range(joint: JointChoice) -> tuple[float, float]:
 
 
 def chosen_ranges(text: str, joints: Sequence[JointChoice]) -> list[tuple[float, float]]:
-    """Parse ranges LOW:HIGH, within the drives' own. Raises ValueError."""
+    """Parse ranges LOW:HIGH, within the drives' own limits. Raises ValueError."""
     words = text.replace(",", " ").split()
     if len(words) not in (1, len(joints)):
         raise ValueError(f"one LOW:HIGH, or {len(joints)} by spaces")
@@ -332,7 +332,7 @@ def chosen_ranges(text: str, joints: Sequence[JointChoice]) -> list[tuple[float,
 
 
 def _plates(file: Path, dialogue: Dialogue) -> None:
-    """Write the marker plates beside the cell file, and wait until they are on the arm."""
+    """Write the marker plates beside the cell file, and wait until the person has mounted them on the arm."""
     dialogue.heading("Markers")
     plate = file.with_name(f"{file.stem}-plate.pdf")
     printing: Callable[..., None] = plugins.load(plugins.COMMANDS, "print-plate")

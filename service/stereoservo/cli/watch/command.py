@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 STATE_EVERY_S = 1.0
 RUNTIME = "(rx: (handover: app), app: (worker_threads: 1))"
-"""Threads of zenoh: what comes is read by the one that hands it on; two more are woken for each message else."""
+"""Threads of zenoh: the receiving thread handles each message itself; otherwise two more are woken per message."""
 LOOK_EVERY_S = 0.1
-"""Unless each frame is asked for: what an eye follows; all at 30 Hz would take twice as much of a core."""
+"""Interval of frames unless each is requested: enough for the eye; all at 30 Hz would cost twice as much of a core."""
 
 
 def watch(
@@ -73,18 +73,18 @@ def watch(
 def _viewers(
     cell: str, port: int | None, rerun: bool, save: Path | None, opened: ExitStack
 ) -> list[FoxgloveServer | RerunViewer]:
-    """The viewers that were asked for; ``opened`` closes them."""
+    """The requested viewers; ``opened`` closes them."""
     found: list[FoxgloveServer | RerunViewer] = []
     if port is not None:
         from stereoservo.cli.watch.foxglove_server import (
             FoxgloveServer,
-        )  # of the extra `cell`: for this alone
+        )  # of the extra `cell`: only for this
 
         server = opened.enter_context(FoxgloveServer(cell, port))
         note(f"in Foxglove: Open connection, ws://localhost:{server.port}")
         found.append(server)
     if rerun:
-        from stereoservo.cli.watch.rerun_viewer import RerunViewer  # of the extra `watch`: for this alone
+        from stereoservo.cli.watch.rerun_viewer import RerunViewer  # of the extra `watch`: only for this
 
         found.append(opened.enter_context(RerunViewer(cell, save)))
     return found

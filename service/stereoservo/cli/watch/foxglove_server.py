@@ -23,7 +23,7 @@ HOST = "127.0.0.1"
 
 
 class FoxgloveServer:
-    """Serves what is shown to it on a ``port`` of this host (0: any). Raises OSError where the port is taken."""
+    """Serves the given messages on a ``port`` of this host (0: any). Raises OSError if the port is in use."""
 
     def __init__(self, cell: str, port: int) -> None:
         self._context = foxglove.Context()
@@ -36,7 +36,7 @@ class FoxgloveServer:
         self._codes: tuple[str, ...] | None = None
 
     def show(self, message: StateMessage | EventMessage | FeaturesMessage) -> None:
-        """Send a message of the cell to all who are connected."""
+        """Send a message of the cell to all connected clients."""
         for published in self._published(message):
             self._channel(published).log(published.encode(), log_time=published.t_ns)
 
@@ -65,7 +65,7 @@ class FoxgloveServer:
         return self._channels[published.topic]
 
     def close(self) -> None:
-        """End the server."""
+        """Stop the server."""
         self._server.stop()
 
     def __enter__(self) -> Self:

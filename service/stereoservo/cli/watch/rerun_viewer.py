@@ -12,12 +12,12 @@ import rerun
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
 SEND_S = 0.4
-"""Messages are handed over in columns so often: one by one, each wakes the threads of the library."""
+"""Interval of passing messages on, in columns [s]: one by one, each would wake the threads of the library."""
 SERIES = ("joints", "velocities", "command", "innovation_px")
 
 
 class RerunViewer:
-    """Shows messages of a ``cell`` in a viewer that is started, or writes them into ``file`` (*.rrd)."""
+    """Shows messages of a ``cell`` in a viewer that is started, or writes them to ``file`` (*.rrd)."""
 
     def __init__(self, cell: str, file: Path | None) -> None:
         self._stream = rerun.RecordingStream(f"stereoservo_{cell}")
@@ -32,7 +32,7 @@ class RerunViewer:
         self._sent_s = 0.0
 
     def show(self, message: StateMessage | EventMessage | FeaturesMessage) -> None:
-        """Log a message of the cell, at the latest ``SEND_S`` after it."""
+        """Log a message of the cell, at most ``SEND_S`` after it."""
         if isinstance(message, EventMessage):
             self._log_text("log", message.t_wall, f"{message.kind}: {message.message}")
         elif isinstance(message, FeaturesMessage):
@@ -59,7 +59,7 @@ class RerunViewer:
         if not names:
             return
         if self._names.get(entity) != names:
-            self._send()  # what is held has the names of before
+            self._send()  # the buffered rows have the old names
             self._names[entity] = names
             self._stream.log(entity, rerun.SeriesLines(names=names), static=True)
         self._series.setdefault(entity, []).append((t_wall, list(values.values())))
@@ -69,7 +69,7 @@ class RerunViewer:
         self._stream.log(entity, rerun.TextLog(text))
 
     def _send(self) -> None:
-        """Hand over series and markers that are held."""
+        """Pass on buffered series and markers."""
         series, self._series = self._series, {}
         for entity, rows in series.items():
             scalars = rerun.Scalars.columns(scalars=[value for _, values in rows for value in values])
@@ -91,7 +91,7 @@ class RerunViewer:
             )
 
     def close(self) -> None:
-        """Hand over what is not shown yet."""
+        """Pass on everything that is not shown yet."""
         self._send()
         self._stream.flush()
 
