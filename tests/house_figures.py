@@ -42,7 +42,7 @@ MODULE_LINES, FUNCTION_LINES = 900, 80
 KERNEL_ARGUMENTS = 6
 PARAMETERS, VERBS = 10, 4
 """Parameters of a function; and verbs of the command line that have more, one for each option."""
-CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 105_000, 540, 130
+CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 105_500, 545, 130
 """Of the product: lines of code, its files, and statements that are not laid out by the formatter (`# fmt: skip`)."""
 ONE_IMPORTER, ONE_IN_FOLDER = 70, 43
 """Modules that one other module alone imports, and those of them in its own folder: a piece that is not read without

@@ -6,7 +6,7 @@ import json
 import re
 import sys
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -15,6 +15,7 @@ import pytest
 from rich.console import Console
 
 from core.conftest import make_bench
+from stereoservo.cli import main as cli
 from stereoservo.control.law import Law
 from stereoservo.core import monitor, move
 from stereoservo.core.state import Holding, Source
@@ -44,7 +45,9 @@ def blocks(heading: str) -> list[tuple[str, str]]:
 
 def module_name(path: str) -> str:
     """Dotted name of a file of the page, which is below its package where it is one of this project."""
-    package = {"core": "stereoservo.", "experiments": "stereoservo_sim."}.get(path.partition("/")[0], "")
+    package = {"core": "stereoservo.", "calibration": "stereoservo.", "experiments": "stereoservo_sim."}.get(
+        path.partition("/")[0], ""
+    )
     return package + path.replace("/", ".")
 
 
@@ -96,24 +99,32 @@ def entry(heading: str, monkeypatch: pytest.MonkeyPatch) -> tuple[ModuleType, An
 def test_every_recipe_has_its_blocks():
     assert list(SECTIONS) == [
         "A control law", "A motion source", "A monitor", "A joint driver",
-        "A driver of servos on a serial line", "A camera driver", "A detector", "An experiment",
+        "A driver of servos on a serial line", "A camera driver", "A detector", "A command", "A fit",
+        "An experiment",
     ]  # fmt: skip
     assert all(blocks(heading) for heading in SECTIONS)
     assert sum(len(blocks(heading)) for heading in SECTIONS) == PAGE.read_text().count("```python")
 
 
-@pytest.mark.parametrize("heading", PLUGINS)
-def test_a_plugin_is_found_by_the_entry_point_of_its_recipe(heading, tmp_path, monkeypatch):
+def installed(heading: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first block of a recipe as a package that is installed in ``folder``."""
     group, name, target = entry_point(heading)
     module, source = blocks(heading)[0]
-    assert target.partition(":")[0] == module
-    info = tmp_path / "acme-1.0.dist-info"
+    info = folder / "acme-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text(f"[{group}]\n{name} = {target}\n")
-    (tmp_path / f"{module}.py").write_text(source)
-    monkeypatch.syspath_prepend(str(tmp_path))
+    (folder / f"{module}.py").write_text(source)
+    monkeypatch.syspath_prepend(str(folder))
     monkeypatch.delitem(sys.modules, module, raising=False)
+
+
+@pytest.mark.parametrize("heading", PLUGINS)
+def test_a_plugin_is_found_by_the_entry_point_of_its_recipe(heading, tmp_path, monkeypatch):
+    group, name, target = entry_point(heading)
+    module, _ = blocks(heading)[0]
+    assert target.partition(":")[0] == module
+    installed(heading, tmp_path, monkeypatch)
     found = plugins.load(group, name)
     monkeypatch.delitem(sys.modules, module)
     if PLUGINS[heading] is not Law:
@@ -167,6 +178,62 @@ def test_the_monitor_stops_an_arm_that_runs_away(monkeypatch, watched):
     for reason in found:
         assert (reason.subject, reason.unit, reason.threshold) == ("j5", "rad/s", 1.2)
         assert reason.value > reason.threshold
+
+
+def test_the_command_runs_by_its_entry_point(tmp_path, monkeypatch, capfd):
+    class Asked:
+        """A client of a cell of two cameras, one without frames."""
+
+        def __init__(self, cell, *, endpoint):
+            assert (cell, endpoint) == ("mycell", None)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            return None
+
+        def status(self):
+            return SimpleNamespace(joints_age_s=0.004, camera_age_s={"left": 0.021, "right": None})
+
+    installed("A command", tmp_path, monkeypatch)
+    monkeypatch.setattr("stereoservo.client.Client", Asked)
+    assert cli.invoke(["ages", "mycell"]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert [line.split(maxsplit=1) for line in lines] == [["joints", "4 ms"], ["left", "21 ms"], ["right", "none yet"]]
+    assert cli.invoke(["ages", "mycell", "--json"]) == 0
+    assert json.loads(capfd.readouterr().out) == {"joints": 0.004, "left": 0.021, "right": None}
+    assert cli.invoke(["ages", "--help"]) == 0
+    assert "Print the ages" in capfd.readouterr().out
+
+
+def test_the_fit_finds_a_line_among_outliers():
+    """Exact points give the line; with a fifth of outliers errors stay within four deviations (40 seeds: 0.5 % by
+    chance), and three points at one place give none.
+    """
+    ((name, source),) = blocks("A fit")
+    fit_line = executed(name, source).fit_line
+    del sys.modules[name]
+    truth = np.array([0.6, 120.0])
+    along, normal = np.array([-np.sin(0.6), np.cos(0.6)]), np.array([np.cos(0.6), np.sin(0.6)])
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        points = 120.0 * normal + rng.uniform(-200.0, 200.0, (50, 1)) * along
+        exact, _ = fit_line(points, 0.5)
+        assert np.abs(upright(exact) - truth).max() < 1e-6
+        seen = points + 0.5 * rng.normal(size=points.shape)
+        seen[:10] += rng.uniform(-40.0, 40.0, (10, 2))
+        found, covariance = fit_line(seen, 0.5)
+        assert (np.abs(upright(found) - truth) < 4.0 * np.sqrt(covariance.diagonal())).all()
+    with pytest.raises(ValueError, match="3 points"):
+        fit_line(np.zeros((3, 2)), 0.5)
+
+
+def upright(state):
+    """A line's state with its angle in [0, π): both normals are the same line."""
+    a, d = state
+    turned = bool(np.floor(a / np.pi) % 2)
+    return np.array([a % np.pi, -d if turned else d])
 
 
 def test_the_experiment_runs_by_its_declaration_and_is_drawn(monkeypatch, tmp_path):

@@ -354,7 +354,9 @@ class Determined:
 
     @property
     def covariance(self) -> FloatArray:
-        """Covariance (p, p) of the chart coordinates at the larger of the stated and the estimated noise."""
+        """Covariance (p, p) of the chart coordinates at the larger of the stated and the estimated noise. Outliers
+        count in the noise of a fit with a robust loss: ``root @ root.T`` is the covariance at the stated sigmas.
+        """
         return np.asarray(self.root @ self.root.T * self.noise)
 
 

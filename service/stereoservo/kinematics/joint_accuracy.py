@@ -18,7 +18,7 @@ class JointAccuracy(msgspec.Struct, frozen=True, eq=False):
     ``random``: changes from stop to stop. ``repeatable``: the same at equal readings of the joint (gear ripple, play
     driven from one side). ``stated``: both together at a reading that is not in the trials; larger than their root sum
     of squares by the uncertainty of the estimates. ``posture``: errors that change slowly with the posture of the whole
-    arm (sag, coupled joints), far from the posture at the model's zero; see `posture_deviations`.
+    arm (sag, coupled joints).
     """
 
     random: FloatArray
