@@ -7,7 +7,7 @@ is relocalized, no goal is reprojected, and the goal stays held.
 A relocalized model keeps the frame, so values stated as points remain valid. Set-points are intersected with the
 cameras they were stated for, by the common pose if they determine one, and projected with the new ones (thesis 8.6).
 
-The core only observes; `calibration.relocalization` computes the model, outside the servo process. The innovation of
+The core only observes; `calibration.relocalized_model` computes the model, outside the servo process. The innovation of
 static objects is constant at rest: if it changes, a camera was moved again, and the relocalization restarts.
 """
 
