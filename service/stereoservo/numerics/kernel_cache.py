@@ -43,10 +43,11 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         for load in (super()._load_overload, self._load_shipped):
             try:
                 found = load(sig, target_context)
-            except Exception as error:  # whatever unpickling and LLVM raise
+            except (AttributeError, ModuleNotFoundError):  # of another version, with types that are no more
+                found = None
+            except Exception as error:  # of a damaged file: whatever unpickling and LLVM raise
                 warnings.warn(
-                    f"{self._name}: its file in the cache is of another version or damaged ({error!r:.200}); "
-                    "compiling it again",
+                    f"{self._name}: its file in the cache is damaged ({error!r:.200}); compiling it again",
                     RuntimeWarning,
                     stacklevel=2,
                 )
