@@ -98,11 +98,11 @@ def entry(heading: str, monkeypatch: pytest.MonkeyPatch) -> tuple[ModuleType, An
 
 def test_every_recipe_has_its_blocks():
     assert list(SECTIONS) == [
-        "A control law", "A motion source", "A monitor", "A joint driver",
+        "A control law", "A motion source", "A monitor", "A joint driver", "A simulated arm",
         "A driver of servos on a serial line", "A camera driver", "A detector", "A command", "A fit",
         "An experiment",
     ]  # fmt: skip
-    assert all(blocks(heading) for heading in SECTIONS)
+    assert [heading for heading in SECTIONS if not blocks(heading)] == ["A simulated arm"]
     assert sum(len(blocks(heading)) for heading in SECTIONS) == PAGE.read_text().count("```python")
 
 
@@ -161,11 +161,37 @@ def test_the_motion_source_swings_a_joint_waits_in_hold_and_ends(monkeypatch):
     assert isinstance(msgspec.msgpack.decode(data, type=Source | module.Nodding), module.Nodding)
 
 
+class Decided:
+    """A state of which only what decisions change may be read."""
+
+    def __init__(self, state):
+        self._state = state
+
+    def __getattr__(self, name):
+        assert name not in ("block", "cameras"), f"`attends` reads `{name}`, which changes without it being called"
+        return getattr(self._state, name)
+
+
+def assert_attends_without_measurements():
+    for one in monitor.MONITORS:
+        one.attends(Decided(make_bench(0).ready().core.state))
+
+
+def test_no_monitor_is_called_by_measurements(monkeypatch):
+    """They would be asked of it after decisions only."""
+    assert_attends_without_measurements()
+    fast = monitor.Monitor("fast", lambda context: (), lambda state: bool(state.block.velocities.any()))
+    monkeypatch.setattr(monitor, "MONITORS", (*monitor.MONITORS, fast))
+    with pytest.raises(AssertionError, match="reads `block`"):
+        assert_attends_without_measurements()
+
+
 @pytest.mark.parametrize("watched", [True, False])
 def test_the_monitor_stops_an_arm_that_runs_away(monkeypatch, watched):
     _, row = entry("A monitor", monkeypatch)
     if watched:
         monkeypatch.setattr(monitor, "MONITORS", (*monitor.MONITORS, row))
+        assert_attends_without_measurements()
     bench = make_bench(0).ready()
     bench.run(0.2)
     assert not bench.core.state.stopped

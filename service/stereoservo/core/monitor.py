@@ -78,7 +78,8 @@ Findings = Iterable[Finding]
 
 class Monitor(NamedTuple):
     """A monitor: ``watch`` processes one step and returns its findings. ``attends`` returns whether it must be called
-    in a step in which `detect` has detected nothing; by default a monitor is called in every step.
+    in a step in which `detect` has detected nothing; by default a monitor is called in every step. ``attends`` is
+    evaluated only after steps in which Python has changed the state: it must not depend on measured values.
     """
 
     name: str
