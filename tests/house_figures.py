@@ -591,18 +591,21 @@ def _module_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:
             yield node
 
 
+def reached(graph: dict[str, set[str]], start: str) -> set[str]:
+    """Nodes that ``start`` reaches by one arrow or more."""
+    seen: set[str] = set()
+    ahead = list(graph[start])
+    while ahead:
+        node = ahead.pop()
+        if node not in seen:
+            seen.add(node)
+            ahead.extend(graph[node])
+    return seen
+
+
 def _strongly_connected(graph: dict[str, set[str]]) -> Iterator[set[str]]:
     """Groups of two or more nodes of which each reaches every other one."""
-    reach: dict[str, set[str]] = {}
-    for start in graph:
-        seen: set[str] = set()
-        ahead = list(graph[start])
-        while ahead:
-            node = ahead.pop()
-            if node not in seen:
-                seen.add(node)
-                ahead.extend(graph[node])
-        reach[start] = seen
+    reach = {node: reached(graph, node) for node in graph}
     done: set[str] = set()
     for node in graph:
         if node in reach[node] and node not in done:

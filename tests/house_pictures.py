@@ -27,7 +27,7 @@ def draw_packages() -> str:
         f"    {package} --> {other}"
         for package, others in sorted(graph.items())
         for other in sorted(others)
-        if not any(other in _reached(graph, between) for between in others - {other})
+        if not any(other in house.reached(graph, between) for between in others - {other})
     ]
     return "\n".join(["flowchart TD", PACKAGES, *lines])
 
@@ -40,16 +40,6 @@ def _package(module: str) -> str:
     if root == "stereoservo":
         return parts[0] if parts else ""
     return "sim.world" if parts[:1] == ["world"] else root.removeprefix("stereoservo_")
-
-
-def _reached(graph: dict[str, set[str]], start: str) -> set[str]:
-    found: set[str] = set()
-    ahead = [start]
-    while ahead:
-        for other in graph[ahead.pop()] - found:
-            found.add(other)
-            ahead.append(other)
-    return found
 
 
 def draw_image_path(path: house.CallPath) -> str:

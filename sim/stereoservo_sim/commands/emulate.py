@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import gc
 import os
 import signal
 import time
@@ -114,7 +113,7 @@ def _named(path: Path, key: str) -> Iterator[None]:
 def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, termination: Termination) -> None:
     from stereoservo_sim.emulators.bus.bus_server import BusServer, open_endpoint, served_channel
     from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_bus_emulator
-    from stereoservo_sim.emulators.console import Console, Printer
+    from stereoservo_sim.emulators.console import Printer, begin_serving
     from stereoservo_sim.emulators.fault_engine import FaultCommandError
 
     with _named(path, "joints.options"):
@@ -143,17 +142,12 @@ def _serve(path: Path, cell: CellFile, runtime_dir: Path, settings: _Settings, t
         raise typer.BadParameter(str(error), param_hint="--order") from error
     printer = Printer(settings.as_json)
     server = BusServer(emulator, endpoint)
-    console = Console(server, printer)
-    console.attach()
-    with contextlib.suppress(OSError):  # may not be allowed
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    gc.freeze()  # imported objects are not scanned again
-    printer.say(
-        "ready",
+    begin_serving(
+        server,
+        printer,
+        PRIORITY,
         f"listening on {server.channel}",
         channel=server.channel,
-        t_ns=emulator.start_ns,
-        pid=os.getpid(),
         nodes=[joint.node_id for joint in options.joint],
         bit_time=drives.bit_time,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import json
 import os
 import queue
@@ -129,3 +131,12 @@ class Console:
         for line in lines:
             if text := line.decode(errors="replace").strip():
                 self.order(text)
+
+
+def begin_serving(server: OrderedServer, printer: Printer, priority: int, text: str, **data: Any) -> None:
+    """Attach the console, run with the real-time ``priority`` where it is permitted, and report ``text`` as ready."""
+    Console(server, printer).attach()
+    with contextlib.suppress(OSError):  # may not be allowed
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
+    gc.freeze()  # imported objects are not scanned again
+    printer.say("ready", text, t_ns=server.start_ns, pid=os.getpid(), **data)

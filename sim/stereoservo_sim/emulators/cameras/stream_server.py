@@ -5,7 +5,6 @@ thread.
 from __future__ import annotations
 
 import contextlib
-import gc
 import html
 import os
 import selectors
@@ -24,7 +23,7 @@ from stereoservo.ports.clock import MonotonicClock
 from stereoservo_sim.emulators.cameras.camera_emulator import NEVER_NS, CameraEmulator, CameraEvent
 from stereoservo_sim.emulators.cameras.emulated_camera import EmulatedCamera, StreamPicture
 from stereoservo_sim.emulators.cameras.stream_settings import CamerasSettings, cameras_of_cell, port_of
-from stereoservo_sim.emulators.console import Console, Printer
+from stereoservo_sim.emulators.console import Printer, begin_serving
 from stereoservo_sim.emulators.fault_engine import EmulationError
 
 SEND_BUFFER = 1 << 17
@@ -495,18 +494,13 @@ def serve_cameras(
     server = CameraServer(emulator, cell=cell.cell.name, port=port, connections=settings.connections)
     emulator.open()
     printer = Printer(as_json)
-    console = Console(server, printer)
-    console.attach()
-    with contextlib.suppress(OSError):  # may not be allowed
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    gc.freeze()  # imported objects are not scanned again
-    printer.say(
-        "ready",
+    begin_serving(
+        server,
+        printer,
+        PRIORITY,
         f"listening on {server.url}: {', '.join(server.streams.values())}",
         channel=server.url,
         streams={name: server.url + path for name, path in server.streams.items()},
-        t_ns=emulator.start_ns,
-        pid=os.getpid(),
     )
     try:
         server.run(ended)

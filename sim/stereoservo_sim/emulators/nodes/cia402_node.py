@@ -632,7 +632,24 @@ class HeartbeatConsumer:
         return min(self._deadlines.values(), default=NEVER_NS)
 
 
-class LifeGuard:
+class Deadline:
+    """Time at which a message that is waited for is overdue; `NEVER_NS` while none is."""
+
+    _deadline_ns = NEVER_NS
+
+    def lost(self, t_ns: int) -> bool:
+        """Whether the message is overdue; reported once."""
+        if t_ns < self._deadline_ns:
+            return False
+        self._deadline_ns = NEVER_NS
+        return True
+
+    def due_ns(self) -> int:
+        """Time at which the message is overdue."""
+        return self._deadline_ns
+
+
+class LifeGuard(Deadline):
     """Node guarding (CiA 301, 7.2.8.2.1): answers remote frames, and monitors that they arrive within 0x100C times
     0x100D, from the first one on. Inactive in a node that produces heartbeats.
     """
@@ -640,7 +657,6 @@ class LifeGuard:
     def __init__(self, dictionary: Dictionary) -> None:
         self._dictionary = dictionary
         self._toggle = 0
-        self._deadline_ns = NEVER_NS
         for index in (GUARD_TIME, LIFE_FACTOR):
             dictionary.changed(index, lambda sub, value: self.reset())
 
@@ -658,17 +674,6 @@ class LifeGuard:
         answer = bytes([state | self._toggle])
         self._toggle ^= TOGGLE
         return answer
-
-    def lost(self, t_ns: int) -> bool:
-        """Whether the next remote frame is overdue; reported once."""
-        if t_ns < self._deadline_ns:
-            return False
-        self._deadline_ns = NEVER_NS
-        return True
-
-    def due_ns(self) -> int:
-        """Time at which the next remote frame is overdue."""
-        return self._deadline_ns
 
 
 class HeartbeatProducer:
@@ -702,7 +707,7 @@ class HeartbeatProducer:
         return self._next_ns
 
 
-class SyncWatch:
+class SyncWatch(Deadline):
     """Monitors SYNC with the period 0x1006 [us]: a loss is reported once after ``factor`` periods, from the first
     SYNC on.
 
@@ -712,7 +717,6 @@ class SyncWatch:
     def __init__(self, dictionary: Dictionary, factor: float) -> None:
         self._dictionary = dictionary
         self._factor = factor
-        self._deadline_ns = NEVER_NS
         self.reset()
         dictionary.changed(SYNC_PERIOD, lambda sub, value: self.reset())
         dictionary.changed(SYNC_ID, lambda sub, value: self._listen())
@@ -729,14 +733,3 @@ class SyncWatch:
         """Process a SYNC."""
         period_ns = self._dictionary.get(SYNC_PERIOD) * 1000
         self._deadline_ns = t_ns + round(self._factor * period_ns) if period_ns else NEVER_NS
-
-    def lost(self, t_ns: int) -> bool:
-        """Whether SYNC is overdue."""
-        if t_ns < self._deadline_ns:
-            return False
-        self._deadline_ns = NEVER_NS
-        return True
-
-    def due_ns(self) -> int:
-        """Time at which SYNC is overdue."""
-        return self._deadline_ns
