@@ -249,8 +249,7 @@ def covering_groups(starts: IntArray, members: IntArray, sides: IntArray, rank: 
     """Which groups, in the order of their ``rank`` (g,), are faces: those that add markers not in a previous one.
 
     First those of four and more with no marker on one side, then all others of four and more, if they add three new
-    markers each;
-    then any with no marker on one side, if they add one new marker each.
+    markers each; then any with no marker on one side, if they add one new marker each.
     """
     groups = rank.shape[0]
     left = np.ones(markers, np.int64)

@@ -85,8 +85,7 @@ def run_loop(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
 
     ``live`` is the servo loop of the demonstration's cell, which moves to a goal in the images and back; ``empty`` is a
     loop that does nothing, beside the daemon in every other segment. ``excess_overruns``: the share of cycles that
-    overran,
-    minus the empty loop's. ``scheduler``: the one that the daemon obtained, not the requested one.
+    overran, minus the empty loop's. ``scheduler``: the one that the daemon obtained, not the requested one.
 
     Raises ExperimentError if the daemon does not start.
     """
@@ -518,8 +517,7 @@ def run_watch(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
     `watch --foxglove` with a program connected that reads every topic, and of `watch --rerun --save`.
 
     ``servo_percent``: of the servo process, with all three beside it and without. ``watched``, ``none``: lateness of
-    the
-    loop; ``ratio``: as in `bench page`.
+    the loop; ``ratio``: as in `bench page`.
 
     Raises ExperimentError.
     """

@@ -107,8 +107,7 @@ class Row:
     """Result of ``detector`` ``on`` a number of ``pictures``.
 
     ``found``: correct ones of ``shown``; ``false``: false ones; ``rms_px``: error, by the measure that ``accuracy``
-    names;
-    and the CPU time per image.
+    names; and the CPU time per image.
     """
 
     on: str

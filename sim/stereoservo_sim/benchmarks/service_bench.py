@@ -91,8 +91,7 @@ while True:
     time.sleep(0.02)
 """
 """Keeps idle TCP sockets open, and reopens one that the listener closes. At least priority, since a remote peer takes
-no
-CPU time of this machine.
+no CPU time of this machine.
 """
 PUTS_REFUSED = """
 import sys, time

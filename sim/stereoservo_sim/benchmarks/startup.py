@@ -50,8 +50,7 @@ def wait_compiled(client: Client) -> StateMessage:
 
 def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: compiled by
-    the
-    first. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
+    the first. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
 
     Raises ExperimentError if the daemon does not start.
     """

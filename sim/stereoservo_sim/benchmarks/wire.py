@@ -63,8 +63,7 @@ def run_wire(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, A
     ``command_us``: with the servo loop between (``hold``). ``put_us``: duration of a put for its caller.
     ``one_way_us``:
     from the creation of a message (a cycle, or a frame's arrival) to a client that waits for it. ``goal_us``: from
-    sending
-    a joint goal to the cycle of its first command, and to the reply.
+    sending a joint goal to the cycle of its first command, and to the reply.
 
     Raises ExperimentError if the daemon does not start.
     """

@@ -70,12 +70,10 @@ class Judgement:
 @dataclass(frozen=True)
 class Steady:
     """Accuracy of following a moving part, from when it was met, ``met_s`` after the goal's start, for ``seconds``,
-    until
-    the belt stopped.
+    until the belt stopped.
 
     Distance of a marker from its position in the goal: rms and largest over markers, cameras and time, 99 % quantile
-    over
-    time, and the largest in space; the part's ``speed_mm_s``. NaN if it was not met.
+    over time, and the largest in space; the part's ``speed_mm_s``. NaN if it was not met.
     """
 
     speed_mm_s: float

@@ -143,8 +143,7 @@ class Operator(Protocol):
 
     def servo(self, target: VisualTarget, law: LawName, follow: tuple[int, ...] = ()) -> str:
         """Execute a goal; with ``follow`` it continues with moving markers. Returns its outcome: ``reached``, or
-        another end
-        with its message.
+        another end with its message.
         """
         ...
 

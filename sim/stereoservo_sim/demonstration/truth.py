@@ -31,8 +31,7 @@ def true_cell(cell: CellFile, folder: Path = Path()) -> SimulatedCell:
     ``folder``: of the cell file.
 
     Cameras of driver ``video`` show the images of ``[emulate.cameras]`` at their address. Raises ValueError if a camera
-    is
-    not one of the simulated rig, or the arm cannot be simulated.
+    is not one of the simulated rig, or the arm cannot be simulated.
     """
     options = [_simulated_options(section, cell) for section in cell.camera]
     shown = any(option.get("workpiece", False) for option in options)

@@ -73,8 +73,7 @@ def upgrade(plane: FloatArray, points: FloatArray) -> FloatArray:
 
 def plane_at_infinity_of(points: FloatArray, X: FloatArray) -> FloatArray:
     """Plane at infinity (4,), unit norm, of exact projective points (n, 4) of a scene X (n, 3): ``hᵀM`` is the divisor
-    of
-    the map to X.
+    of the map to X.
     """
     plane = homography_from_points(points, to_homogeneous(X))[3]
     return np.asarray(plane / np.linalg.norm(plane))
@@ -122,8 +121,7 @@ class Bound:
 
 def cramer_rao(rig: StereoRig, X: FloatArray, shifts: FloatArray, sigma: float) -> Bound:
     """Bound for points X (n, 3) [m] seen at rest and after translations ``shifts`` (s, 3) [m] with noise ``sigma``
-    [px],
-    with cameras known up to a projective frame, and unknown points and motions.
+    [px], with cameras known up to a projective frame, and unknown points and motions.
     """
     P = np.array([camera.P for camera in rig.cameras])
     points = to_homogeneous(X)

@@ -322,8 +322,7 @@ TRIED_GAIN, TRIED_SEEDS = 1.0, 4
 
 def benchmark_task(where: str) -> AlignmentTask:
     """The benchmark's task. ``centred``: only the rotation; ``aside``: the plate's centre moves from one side of the
-    axis
-    to the other.
+    axis to the other.
     """
     goal = translation(ASIDE_M[where], 0.0, DEPTH_M) @ rotation("y", TILT_DEG)
     start = rotation("z", 180.0) @ goal
@@ -365,8 +364,7 @@ def placed_rx90(task: AlignmentTask, seed: int, tries: int = 2000) -> SyntheticC
 
     Configurations at the start are drawn by seed. The Cartesian laws must then drive it with an exact model, for
     several seeds of the noise, which decides the sense of half a turn. Home is the configuration nearest to the start
-    in
-    which the plate is at mid-range.
+    in which the plate is at mid-range.
     """
     rng, cell = np.random.default_rng([seed, 90]), rx90_cell()
     low, high = RX90_LIMITS[:, 0] + LIMIT_MARGIN, RX90_LIMITS[:, 1] - LIMIT_MARGIN

@@ -27,8 +27,7 @@ REPRODUCED = (
 
 class ThesisItem(NamedTuple):
     """Tables or figures by ``number``, their content, and the ``experiment`` that reproduces them, or the reason for
-    none
-    (``instead``).
+    none (``instead``).
     """
 
     number: str

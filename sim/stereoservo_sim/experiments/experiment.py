@@ -154,8 +154,7 @@ class Option:
 @dataclass(frozen=True)
 class Experiment:
     """An experiment by its ``name`` on the command line. ``seeds``: default number of repetitions, each with its own
-    seed;
-    0: it takes no ``--seeds``. ``module``: below ``experiments``. ``own``: its options beside these.
+    seed; 0: it takes no ``--seeds``. ``module``: below ``experiments``. ``own``: its options beside these.
     ``timed``: the answer has the CPU time, ``cpu_s``.
     """
 

@@ -45,9 +45,8 @@ class TagView:
     """One tag in one image: ``corners`` (4, 2) [px] in the dictionary's order, clockwise from the printed top left.
 
     ``sigmas`` (4,) [px]: of the corners, per axis, from the noise of the image. ``start``: the corners of cv2's
-    subpixel
-    refinement. ``registered``: whether the pattern fit was accepted; otherwise ``blur`` [px] and ``correlation`` of
-    pattern and image are NaN.
+    subpixel refinement. ``registered``: whether the pattern fit was accepted; otherwise ``blur`` [px] and
+    ``correlation`` of pattern and image are NaN.
     """
 
     corners: FloatArray

@@ -201,8 +201,7 @@ def run_imperfect_arms(
     seeds: int, seed: int = 0, model: str = "self", progress: ProgressCall = silent
 ) -> dict[str, Any]:
     """Cases ``seed`` to ``seed + seeds - 1``: outcomes with Wilson bounds, every goal that is not reached with the
-    core's
-    report, and every goal falsely reported as reached.
+    core's report, and every goal falsely reported as reached.
 
     Raises ExperimentError for an unknown ``model``.
     """
@@ -290,8 +289,7 @@ tolerance, and the part of it by which cameras may be displaced (`core.sources.p
 class CreepVerdict(msgspec.Struct, frozen=True):
     """Outcome of a goal, sent ``minutes`` after the first step: ``outcome`` as reported by the core, ``codes`` and
     ``verdict`` of the core, the true ``error_px`` in the images of static cameras, the camera's displacement
-    ``crept_px``
-    in its images there, and the distance of the body from its goal [mm].
+    ``crept_px`` in its images there, and the distance of the body from its goal [mm].
     """
 
     seed: int

@@ -50,9 +50,8 @@ class ArmFamily:
     """A family of arms.
 
     ``axes`` draws an arm; ``judge`` solves poses (N, 4, 4), or their effect on points (N, 3), for an arm: (N, s, n);
-    None
-    for a redundant arm. ``single_point``: whether the goals are those of one point. ``singular`` draws a singular pose.
-    ``bounded``: whether goals 5 m away are out of reach.
+    None for a redundant arm. ``single_point``: whether the goals are those of one point. ``singular`` draws a singular
+    pose. ``bounded``: whether goals 5 m away are out of reach.
     """
 
     axes: Callable[[np.random.Generator], EuclideanAxes]

@@ -56,8 +56,7 @@ MODELS = ("learnt", "true")
 
 class DriveVerdict(msgspec.Struct, frozen=True):
     """Outcome of a case: by model, the goal's end, its true error [px] at rest and the overshoot. ``code``: why there
-    is
-    none.
+    is none.
     """
 
     seed: int

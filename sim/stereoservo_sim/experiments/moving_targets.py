@@ -155,8 +155,7 @@ def cell_of(place: str) -> CellFile:
 
 def motion_of(place: str, name: str, seed: int, since_ns: int) -> Motion:
     """One of `MOTIONS` in a cell, with a direction or axis drawn from the seed; of turntables the first that the arm
-    can
-    follow without a wrist singularity or the end of a joint's range.
+    can follow without a wrist singularity or the end of a joint's range.
     """
     cell, way = world_of(place), MOTIONS[name]
     if way.turn:
@@ -184,8 +183,7 @@ def turntable_of(cell: SimulatedCell, turn: float, rng: np.random.Generator, sin
     sight.
 
     With cameras on the arm the axis may be anywhere around the target; beside a workpiece it is on the body's side, so
-    that
-    the arm can reach the body's pose all the time.
+    that the arm can reach the body's pose all the time.
     """
     to_world = _camera_to_world(cell)
     axis = to_world @ np.array([*rng.uniform(-TILT, TILT, 2), 1.0])

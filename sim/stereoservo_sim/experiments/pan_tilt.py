@@ -435,8 +435,7 @@ def step_errors(
     pairs: list[tuple[int, int]],
 ) -> FloatArray:
     """Predicted minus extracted pixels (pairs, c, m, 2) [px]: from ``pixels`` (c, s, m, 2) of one image to ``target``
-    of
-    the other.
+    of the other.
     """
     return np.array([feed_forward(seen, positions[i], pixels[:, i], positions[j])[0] - target[:, j] for i, j in pairs])
 

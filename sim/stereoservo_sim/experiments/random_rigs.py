@@ -430,8 +430,7 @@ class MechanicsVerdict(msgspec.Struct, frozen=True):
     95 % ellipses, ``code`` and ``message`` of a refusal.
 
     ``over_told``: ratio of the error of these markers to that of a fit given the true joints in the trials (of a
-    perfect
-    arm), and ``seconds_told`` of its CPU time beside our ``seconds``; 0 if it fails.
+    perfect arm), and ``seconds_told`` of its CPU time beside our ``seconds``; 0 if it fails.
     """
 
     seed: int

@@ -462,8 +462,7 @@ def judged(fitted: PoseFit, out: BoolArray) -> HeldOut:
 
 def coverage(held: HeldOut) -> Coverage:
     """Validity of the predicted covariances. Corners of one view share the error of the arm's pose: the scatter of
-    their
-    share is at most that of as many trials as there are views.
+    their share is at most that of as many trials as there are views.
     """
     known = np.isfinite(held.squares)
     squares, count = held.squares[known], int(known.any(axis=2).sum())

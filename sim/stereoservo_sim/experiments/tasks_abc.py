@@ -66,8 +66,7 @@ class PlatePictures:
     """Source of the plate's pixels (`stereoservo_sim.tasks.closed_loop.PlateSight`) by rendered images.
 
     ``predicts``: the detector is given the controller's expectation, and the loop continues if nothing is found.
-    Otherwise
-    it searches the whole images, and has to find all four markers in both.
+    Otherwise it searches the whole images, and has to find all four markers in both.
 
     Attributes:
         found: number of markers found in both images, frame by frame.

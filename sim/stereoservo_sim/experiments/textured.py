@@ -156,8 +156,7 @@ def boards(distance: float) -> TexturedBody:
 
 def _stripes(length: float, begin: float) -> tuple[FloatArray, FloatArray]:
     """For each texel along ``length`` [m], with squares from ``begin`` on: the share that they cover, and the sign,
-    which
-    alternates from square to square.
+    which alternates from square to square.
     """
     step = length / (TEXELS - 1)
     fine = step * (np.arange(TEXELS)[:, None] + (np.arange(FINE) + 0.5) / FINE - 0.5)

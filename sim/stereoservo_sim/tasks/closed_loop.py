@@ -77,8 +77,7 @@ class LoopSettings:
     """Settings of the tasks' execution.
 
     ``law``: of `LAWS`, `CLASSICAL`, or ``euclidean-points`` for metric models. ``first_order``: laws with a step
-    correction
-    do not use it. ``joint_speed`` [rad/s or m/s]: limit of the fastest joint, the others in proportion.
+    correction do not use it. ``joint_speed`` [rad/s or m/s]: limit of the fastest joint, the others in proportion.
     ``drop_camera``: start and duration [s] of an interval without the second camera. ``centre``: ``middle``
     of the markers or the number of one. ``mechanics``: of the arm ``rx90``; None: perfect. ``core``: the servo
     core drives the arm, which needs joints and a model; else the law alone. ``coasts``: the law continues with the
@@ -114,8 +113,7 @@ class PlateSight(Protocol):
         """Pixels (c, m, 2) and visibility (c, m), 1 or 0, with the plate at ``pose`` (4, 4).
 
         ``expected`` (c, m, 2): pixels expected by the controller, None at first. Returns None if too little is visible
-        to
-        continue.
+        to continue.
         """
         ...
 
@@ -172,8 +170,7 @@ class Trace:
     """Recorded path of a task: ``poses`` (k, 4, 4) of the plate, ``errors_px`` (k,), ``facing`` (k,) cosines.
 
     ``joints`` (k, n): the arm's readings. ``task_errors`` (k - 1, e): the law's error components at each step, NaN if
-    it
-    was not called.
+    it was not called.
     """
 
     poses: FloatArray
@@ -746,8 +743,7 @@ class PlannedPath:
         """Current set-points of the plan, with their velocities as a difference over ``dt_s``.
 
         Likewise its joint positions, for an arm at ``joints`` (n,). The plan's time advances by ``dt_s``, or less if
-        the body
-        lags.
+        the body lags.
         """
         set_points = self._set_points(scene)
         apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))

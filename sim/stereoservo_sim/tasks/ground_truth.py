@@ -28,8 +28,7 @@ class PlateView(NamedTuple):
     """True images of the plate: ``pixels`` (c, m, 2), and the worst measures over markers and cameras used.
 
     ``margin_px``: to the nearest border, negative out of view; ``depth_m``; ``facing``: cosine between a camera's line
-    of
-    sight and the plate's normal, negative if it sees the back.
+    of sight and the plate's normal, negative if it sees the back.
     """
 
     pixels: FloatArray
@@ -112,8 +111,7 @@ def noise_floor_px(goal: FloatArray, noise_px: float, gain: float, dt_s: float, 
 
     The least-squares pose of each single frame has the covariance ``σ²(JᵀJ)⁻¹``. A loop in which an error decays by
     ``exp(-gain·dt)`` a step passes the share ``λ/(2 - λ)``, ``λ = 1 - exp(-gain·dt)``, of it. The mean over its
-    directions
-    is taken from 4096 fixed draws.
+    directions is taken from 4096 fixed draws.
     """
     if noise_px == 0.0:
         return 0.0

@@ -40,8 +40,7 @@ class PinholeCamera:
     @property
     def least_k1(self) -> float:
         """The least ``k1`` with which the distorted image just reaches the farthest corner: there 27/4 |k| s² = 1, with
-        s the
-        raw radius.
+        s the raw radius.
         """
         right, bottom = self.width - 0.5, self.height - 0.5
         corners = np.array([(-0.5, -0.5), (right, -0.5), (-0.5, bottom), (right, bottom)])

@@ -27,10 +27,8 @@ class Conveyor(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Section ``[emulate.conveyor]``: motion of parts on the belt, in the world's axes.
 
     A part is put onto the belt at ``begin_m`` [m] from its initial position in the cell, and carried at
-    ``velocity_m_s``
-    [m/s] for ``for_s``; then the belt stops. ``every_s``: interval after which the next part starts at ``begin_m``;
-    None:
-    there is one part.
+    ``velocity_m_s`` [m/s] for ``for_s``; then the belt stops. ``every_s``: interval after which the next part starts at
+    ``begin_m``; None: there is one part.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres]

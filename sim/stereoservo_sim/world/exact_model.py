@@ -39,8 +39,7 @@ def exact_model(
     """Model of ``cell`` in the canonical projective frame with ``plane`` as its plane at infinity.
 
     ``plane`` must not pass between the markers as seen from the left camera; the default is clear of them for cameras
-    of
-    ordinary focal lengths. ``zero``: joint zeros, home if None. ``stratum``: of the model.
+    of ordinary focal lengths. ``zero``: joint zeros, home if None. ``stratum``: of the model.
     """
     zero = cell.home if zero is None else zero
     normaliser = pixel_normaliser(cell.width, cell.height)

@@ -29,14 +29,11 @@ class Lighting(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ``adapt_s``: time constant of an automatic exposure that follows the ambient light, 0: fixed exposure.
     ``swing``: relative amplitude of an exposure oscillation of period ``swing_s``.
     ``shadow``: share of light that a shadow blocks; ``shadow_px`` wide, edges of ``soft_px`` (sigma), crossing the
-    image
-    once in ``shadow_s``.
+    image once in ``shadow_s``.
     ``spot``: grey levels of a lamp's reflection of radius ``spot_px`` (sigma), which circles about the image centre
-    once in
-    ``spot_s``.
+    once in ``spot_s``.
     ``flicker``: share of light that varies at ``flicker_hz``, seen as bands since rows are read out one after another
-    in
-    ``readout_s``.
+    in ``readout_s``.
     """
 
     level: Positive = 1.0

@@ -36,8 +36,7 @@ def synthetic_load(cell: SyntheticCell, q: FloatArray) -> FloatArray:
 
 def approaches(positions: FloatArray, start: FloatArray) -> FloatArray:
     """Directions (s, n), -1, 0 or 1, in which each joint last moved on the path from ``start`` (n,) through
-    ``positions``
-    (s, n); 0: not moved.
+    ``positions`` (s, n); 0: not moved.
     """
     steps = np.sign(np.diff(np.vstack([start, positions]), axis=0))
     for k in range(1, len(steps)):

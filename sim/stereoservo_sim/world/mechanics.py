@@ -126,8 +126,7 @@ def chosen_mechanics(
     """Mechanics of a cell file's joints; None if none are stated.
 
     ``prismatic``: joints that a preset's gear drives by a pinion; empty: none. Raises ValueError for unknown joints,
-    and
-    for a first joint that is coupled to a previous one.
+    and for a first joint that is coupled to a previous one.
     """
     if option == "none" or option == {}:
         return None

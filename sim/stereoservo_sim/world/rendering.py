@@ -81,12 +81,10 @@ class Renderer:
         """The image (height, width) with the arm at ``q`` (n,) [rad]; ``rng`` gives this frame's noise.
 
         ``workpiece`` (4, 4): its pose in the world; default: its initial pose. Links nearer than the workpiece are
-        drawn over
-        it if they are nearer than the body, too. ``focus``: focal length for drawing the body as a multiple of the
-        camera's.
+        drawn over it if they are nearer than the body, too. ``focus``: focal length for drawing the body as a multiple
+        of the camera's.
         ``at_row``: arm position at a row's exposure, in bands of ``BAND`` rows, used in place of ``q``. ``t_s``: time
-        since the
-        start of the light variation.
+        since the start of the light variation.
         """
         camera = self.camera.focused(focus)
         if at_row is None:
@@ -198,8 +196,7 @@ def draw_faces(
     """Draw a body at ``body_pose`` (4, 4) into ``image`` (height, width), [grey levels], without blur and noise.
 
     Of a solid the faces turned to the camera, shaded by its light. Otherwise faces turned away show their dull backs
-    and
-    are drawn first: the body is convex, so no face turned to the camera is hidden by another.
+    and are drawn first: the body is convex, so no face turned to the camera is hidden by another.
 
     Returns:
         The region touched (left, top, right, bottom) [px], or None if nothing was drawn.

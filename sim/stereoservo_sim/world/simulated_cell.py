@@ -24,9 +24,8 @@ class SimulatedCell:
     """Arm, body, cameras; ``base`` (n,) [rad] is the configuration around which the cell is laid out.
 
     Eye-to-hand: the body is on the flange and the rig is fixed in the world. Eye-in-hand: ``stand`` (4, 4) is the
-    body's
-    fixed pose in the world, and the flange carries the rig, which is given in its frame. ``workpiece``: a second marked
-    object beside the body, if any.
+    body's fixed pose in the world, and the flange carries the rig, which is given in its frame. ``workpiece``: a second
+    marked object beside the body, if any.
     """
 
     robot: Robot
@@ -72,8 +71,7 @@ class SimulatedCell:
 
     def visible(self, q: FloatArray, camera: PinholeCamera, *, max_incidence: float = MAX_INCIDENCE) -> BoolArray:
         """Mask (m,) of the markers that ``camera`` of the rig sees at ``q`` (n,): those of :meth:`turned_to` that no
-        link
-        occludes.
+        link occludes.
         """
         camera = self.in_world(camera, q)
         seen = self.turned_to(self.body_pose(q), camera, max_incidence=max_incidence)

@@ -18,8 +18,7 @@ REST_VELOCITY = 1e-9
 
 class Plant(Protocol):
     """Protocol of the plant that the drives move. True ``positions``, ``velocities`` of the links and ``efforts`` of
-    the
-    motors [N m or N], (n,).
+    the motors [N m or N], (n,).
     """
 
     positions: FloatArray
@@ -118,10 +117,8 @@ class DriveBank:
     """Velocity drives of all joints on a fixed time grid, with a common command time-out.
 
     The set-points advance in steps of ``step_ns``, never beyond the requested time. After ``timeout_ns`` without a
-    command
-    the drives brake by themselves; once they are at rest, time is skipped, so that catching up after a stall costs at
-    most
-    the time-out and the brake ramp.
+    command the drives brake by themselves; once they are at rest, time is skipped, so that catching up after a stall
+    costs at most the time-out and the brake ramp.
     """
 
     def __init__(

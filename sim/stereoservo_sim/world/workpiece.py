@@ -59,8 +59,8 @@ class Motion(Moved, frozen=True, forbid_unknown_fields=True):
     ``for_s``.
 
     It translates at ``velocity_m_s``, rotates at ``turn_rate_deg_s`` about an axis through ``about_m`` [m] from its
-    origin
-    (a turntable's), and oscillates along ``swing_m`` at ``swing_hz``; it restarts from its beginning every ``every_s``.
+    origin (a turntable's), and oscillates along ``swing_m`` at ``swing_hz``; it restarts from its beginning every
+    ``every_s``.
     """
 
     velocity_m_s: tuple[Metres, Metres, Metres] = (0.0, 0.0, 0.0)

@@ -262,8 +262,7 @@ def cartesian_step(
     ``operators`` (n, 4, 4): at the current configuration (5.21); ``camera_centres`` (c, 4): of height ``a∞ᵀM = 1``.
 
     Task error: τ in lengths of the frame's coordinates, angles [rad], all >= 0; allowed: the part of it that visibility
-    allows;
-    status: `ComponentStatus`.
+    allows; status: `ComponentStatus`.
     """
     points, targets, centre, centre_target = task
     n, dt_s = operators.shape[0], pace.dt_s

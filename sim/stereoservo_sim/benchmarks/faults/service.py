@@ -69,8 +69,7 @@ def memory_disk(bench: ServiceBench) -> None:
 
 def image_disk(bench: ServiceBench) -> None:
     """Put it on an ext4 image, which, unlike a file system in memory, can become read-only while files on it are open,
-    as
-    a disk with errors does. Raises VoidTrialError.
+    as a disk with errors does. Raises VoidTrialError.
 
     The image is in memory: writes to a disk shared with the trial's drives and slots could delay these.
     """
@@ -234,17 +233,13 @@ class ServiceFault:
     """A fault injected into the service, and its required consequences.
 
     ``process``, ``signal``: of the daemon's, or ``client``; or an act of the bench by ``act``. ``bound_ms``: to rest;
-    None
-    if the arm continues; with ``may_go_on`` it either rests by then or continues. ``after``: allowed results of
-    `status` a
-    second later, the lifecycle or the code of its error. ``client``: program of a separate client process that moves
-    the
-    arm; else the bench moves it at ``speed_scale``. ``note``: text in a status note once the daemon is ready again; its
-    state is then deleted. ``disk``: file system of the state directory while a daemon runs. ``notes``: texts in the
-    notes a
-    second later. ``reaches``: the goal continues until it is reached, with the cause present. ``check``: failures after
-    the
-    cause is removed. ``trials_a_daemon``: number after which the daemon is ended, 0 if it continues.
+    None if the arm continues; with ``may_go_on`` it either rests by then or continues. ``after``: allowed results of
+    `status` a second later, the lifecycle or the code of its error. ``client``: program of a separate client process
+    that moves the arm; else the bench moves it at ``speed_scale``. ``note``: text in a status note once the daemon is
+    ready again; its state is then deleted. ``disk``: file system of the state directory while a daemon runs. ``notes``:
+    texts in the notes a second later. ``reaches``: the goal continues until it is reached, with the cause present.
+    ``check``: failures after the cause is removed. ``trials_a_daemon``: number after which the daemon is ended, 0 if it
+    continues.
     """
 
     name: str

@@ -48,8 +48,7 @@ def arbitration_key(frame: CanFrame) -> tuple[int, int, int, int, int]:
     """Bits of the arbitration field in the order of transmission, dominant as 0: the smallest wins.
 
     So a data frame wins against the remote frame of the same id, and a standard frame against an extended one that
-    begins
-    alike.
+    begins alike.
     """
     if frame.extended:
         return frame.id >> 18, 1, 1, frame.id & 0x3FFFF, int(frame.remote)
@@ -219,10 +218,8 @@ class BusEmulator:
 
     ``plant`` moves the nodes' axes, in their order. ``bitrate`` [bit/s]: of the wire; None: frames take no time.
     Events at the same instant are processed in a fixed order (the wire, delayed frames, nodes in their order, the
-    plant),
-    so that the same calls give the same frames. ``on_adapter`` is called when the adapter is unplugged (False) or
-    plugged
-    in again (True).
+    plant), so that the same calls give the same frames. ``on_adapter`` is called when the adapter is unplugged (False)
+    or plugged in again (True).
     """
 
     def __init__(

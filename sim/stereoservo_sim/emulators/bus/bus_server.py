@@ -40,8 +40,7 @@ ENDING_NS = 500_000_000
 
 class Stalls(msgspec.Struct):
     """Lateness of the serving loop: the largest lateness and gap, number of stalls (over STALL_NS), and number of
-    frames
-    that left more than LATE_FRAME_NS after their end on the bus.
+    frames that left more than LATE_FRAME_NS after their end on the bus.
     """
 
     turns: int = 0

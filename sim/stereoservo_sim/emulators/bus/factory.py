@@ -42,10 +42,8 @@ class DrivesSettings(ArmPlace, frozen=True, forbid_unknown_fields=True, kw_only=
     ``plant``: ``pybullet``, the simulated arm as rigid bodies (joints of its names), or ``ideal``, any joints, without
     mass. ``bit_time``: frames take their time on the wire. ``start``: initial positions by joint [rad or m];
     ``resume``: if the arm's truth file exists, start at its last positions. ``brake_ms``: time the brakes take to open
-    and
-    to close. ``rated_torques`` by joint [N m or N] if they differ from the driver's. ``eds``: of the emulated drives if
-    it
-    differs from the driver's, relative to the cell file. ``machine``: see PlantSettings.
+    and to close. ``rated_torques`` by joint [N m or N] if they differ from the driver's. ``eds``: of the emulated
+    drives if it differs from the driver's, relative to the cell file. ``machine``: see PlantSettings.
     ``mechanics``: a preset, or imperfections by joint, see `stereoservo_sim.world.mechanics`; encoders have the
     driver's counts.
     """

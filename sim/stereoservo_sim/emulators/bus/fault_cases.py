@@ -16,12 +16,11 @@ class FaultCase(msgspec.Struct, frozen=True, kw_only=True):
     ``stage``: when the fault occurs: running; when the arm is enabled and about to move (standing; times count from its
     first command); before bring-up (start); or a fault whose reset is then tried (reset). ``orders``: commands for the
     emulated bus at that moment. ``host``: what happens to the master's computer then. ``codes``: what the master may
-    latch
-    first, or bring-up may refuse with, one or several by the fault's phase; empty: nothing latches, motion continues.
-    ``bound_ms``: from the fault to all axes at rest. ``by``: the side that ends motion. ``afterwards``: ordered once
-    the
-    axes rest: it removes the cause, and nothing may move again by itself. ``options``: changes of the cell's options.
-    ``warm_s``: motion before the fault. ``towards``: the node that has to move in its positive direction; 0: none.
+    latch first, or bring-up may refuse with, one or several by the fault's phase; empty: nothing latches, motion
+    continues. ``bound_ms``: from the fault to all axes at rest. ``by``: the side that ends motion. ``afterwards``:
+    ordered once the axes rest: it removes the cause, and nothing may move again by itself. ``options``: changes of the
+    cell's options. ``warm_s``: motion before the fault. ``towards``: the node that has to move in its positive
+    direction; 0: none.
     """
 
     name: str

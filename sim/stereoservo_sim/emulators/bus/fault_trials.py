@@ -324,10 +324,8 @@ class VirtualHost(Subscriptions):
     """A link for bring-up and, after ``begin_cycle``, the master's ticks on an absolute grid.
 
     Frames enter the wire at the tick's time and reach the master when they end on the bus. ``velocities`` (n,): written
-    by
-    the servo loop each cycle; None: it does not call the port. ``cycling`` False: the thread of the cycle hangs or is
-    dead,
-    and neither receives nor sends; frames that arrive meanwhile wait.
+    by the servo loop each cycle; None: it does not call the port. ``cycling`` False: the thread of the cycle hangs or
+    is dead, and neither receives nor sends; frames that arrive meanwhile wait.
     """
 
     def __init__(self, emulator: BusEmulator, master: Master) -> None:

@@ -34,9 +34,8 @@ class PlantSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
     ``brake_s``: from closing until the axis is at rest. ``coast_deceleration``: of an axis without power and brake.
     ``end_stop_margin``: distance of the mechanical stops beyond the position limits. ``contact_stiffness``: effort per
-    unit
-    of a blocked axis's lag; ``effort_max``: at which the drive's current saturates. For a plant without torques of its
-    own: ``inertia`` (effort per unit/s²), ``friction``, ``gravity`` (times the cosine of the position).
+    unit of a blocked axis's lag; ``effort_max``: at which the drive's current saturates. For a plant without torques of
+    its own: ``inertia`` (effort per unit/s²), ``friction``, ``gravity`` (times the cosine of the position).
     """
 
     brake_s: Positive = 0.02

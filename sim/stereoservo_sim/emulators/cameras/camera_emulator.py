@@ -201,8 +201,7 @@ LARGEST_SIZE = 4096
 
 class CameraCommand(FaultCommand, frozen=True):
     """One fault command. ``camera``: its name, or ``all``. ``number``: depends on the verb: a count, a share, a gain,
-    an
-    angle [deg]; ``length_m``; ``size`` (width, height); ``what``: a second word.
+    an angle [deg]; ``length_m``; ``size`` (width, height); ``what``: a second word.
     """
 
     camera: str = ""

@@ -24,9 +24,8 @@ class StreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw
     """One camera: ``[[emulate.cameras.camera]]``.
 
     ``path`` of its stream (default: ``/NAME.mjpg``). ``view``: the camera of the simulated rig (default: the one of
-    this
-    name); ``k1``, ``moved``: as of the simulated cameras. Shutters open at ``k / rate_hz + skew_ms``; an image is sent
-    ``latency_ms`` later, varied by up to ``jitter_ms`` to either side. ``drop_rate``: probability that an image is
+    this name); ``k1``, ``moved``: as of the simulated cameras. Shutters open at ``k / rate_hz + skew_ms``; an image is
+    sent ``latency_ms`` later, varied by up to ``jitter_ms`` to either side. ``drop_rate``: probability that an image is
     lost.
     ``gain``: of the exposure.
     """
@@ -53,11 +52,9 @@ class CamerasSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True, k
     """Section ``[emulate.cameras]``.
 
     ``port`` on this host; 0: a free one, reported when ready. ``background``: ``pybullet`` is its rendered arm,
-    refreshed
-    now and then; ``arm`` draws room and arm for every image; ``plain`` is a uniform grey. ``noise``: sigma of the
-    sensor [grey levels]; ``blur``: sigma of the lens [px]. ``quality``: of the JPEGs. ``workpiece``: whether there is
-    one
-    beside the body. ``seed``: of noise, losses and jitter. ``connections``: largest number at the same time.
+    refreshed now and then; ``arm`` draws room and arm for every image; ``plain`` is a uniform grey. ``noise``: sigma of
+    the sensor [grey levels]; ``blur``: sigma of the lens [px]. ``quality``: of the JPEGs. ``workpiece``: whether there
+    is one beside the body. ``seed``: of noise, losses and jitter. ``connections``: largest number at the same time.
     """
 
     host: Literal["127.0.0.1"] = "127.0.0.1"

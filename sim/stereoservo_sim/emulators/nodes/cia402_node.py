@@ -204,8 +204,7 @@ class Cia402Node:
 
     def _connection_aborted(self, code: int) -> None:
         """Reaction 0x6007 to a lost connection. An NMT command is a fault only of a powered drive, a lost heartbeat of
-        every
-        drive.
+        every drive.
         """
         powered = self.machine.powered
         if self.machine.connection_aborted() and (powered or code == HEARTBEAT_LOST):

@@ -94,10 +94,8 @@ class PowerMachine:
     ``option(index)``: the drive's option codes. ``clear_faults()``: called for a fault reset; returns whether it
     succeeds.
     ``ramp``: how the drive is to come to rest, None without a request; ``after``: the state that follows once it is at
-    rest
-    and the brake is closed, None: it stays, held by torque. ``opening``: power is on and the brake opens, before
-    ENABLED
-    (transition 4 is complete when the drive can move).
+    rest and the brake is closed, None: it stays, held by torque. ``opening``: power is on and the brake opens, before
+    ENABLED (transition 4 is complete when the drive can move).
 
     A command that changes the state is completed before the next (IEC 61800-7-201): one that arrives while the drive
     slows down for transition 5 or 8 waits, the newest counts; disable voltage and quick stop do not wait. Transition
@@ -478,8 +476,7 @@ class DriveMotion:
         """Enabled: follow the target velocity within the drive's limits, with ramps of 0x6083 and 0x6084.
 
         In cyclic synchronous velocity the standard leaves ramps to the master; this drive, like many, limits the
-        acceleration
-        by 0x6083 there, in both directions.
+        acceleration by 0x6083 there, in both directions.
         """
         axis, get = self.axis, self._dictionary.get
         mode = get(0x6061)

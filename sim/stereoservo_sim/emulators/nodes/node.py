@@ -49,8 +49,7 @@ class NodeSettings:
 
     ``tick_ns``: period of the drive's own control while its power stage is on. ``sync_timeout_factor``: periods of
     0x1006 without SYNC that cause error 0x8700. ``following_window``: limit of the following error [rad or m] if the
-    EDS
-    has no 0x6065. ``identity``: of 0x1018 by sub-index, overrides the joint's options.
+    EDS has no 0x6065. ``identity``: of 0x1018 by sub-index, overrides the joint's options.
     ``pdos_by_default``: whether the EDS's PDOs exist after power on (they do in EPOS4: RPDO 3 and 4 then receive
     control words on 0x400 and 0x500 + node id); False switches all off. ``reset_needs_communication_reset``: after
     0x8130 and 0x8120 the drive refuses a fault reset until NMT reset communication (EPOS4).

@@ -51,8 +51,7 @@ class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     ``flange``: the link that carries the body (default: see `urdf_file.load_urdf`).
     ``mounted``: pose of the arm's root in the world.
     ``carried``: displacement of the marker body on the flange (of the rig, if the cameras are on the arm) from its
-    default
-    pose, which looks along the flange's z from in front of the parts there.
+    default pose, which looks along the flange's z from in front of the parts there.
     ``base``: positions by joint [rad or m] around which the cell is laid out; those of omitted joints are searched for.
     ``distance_m``: from the rig to the body; default 1.4 m, or 0.85 m if the cameras are on the arm.
     ``baseline_m``: between the cameras; ``focal_px``: of both.
@@ -152,8 +151,7 @@ def _reach(robot: Robot) -> float:
 
 def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
     """Base configuration (n,): joints clear of their limits, the body's motion well-conditioned, and the body visible
-    in
-    all cameras there and while each joint moves alone. Raises ValueError if none is found.
+    in all cameras there and while each joint moves alone. Raises ValueError if none is found.
     """
     stated = _stated(robot, place.base)
     if not np.isnan(stated).any():
