@@ -82,6 +82,7 @@ EventKind = Literal[
     "fault",
     "calibration_progress",
     "calibration_sample",
+    "calibration_frames",  # of a sweep of calibration
     "calibration_finished",
     "calibration_aborted",
     "check_finished",
@@ -112,23 +113,27 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
     scatter: FloatArray
 
 
-class WayFrame(msgspec.Struct, frozen=True, eq=False):
-    """A frame taken during motion to a stop: number of its ``camera`` in the cell, stated shutter time, some markers'
-    ``ids`` (k,) and raw ``pixels`` (k, 2).
+class PathFrame(msgspec.Struct, frozen=True, eq=False):
+    """A frame taken in motion: number of its ``camera`` in the cell, stated shutter time, markers' ``ids`` (k,), raw
+    ``pixels`` (k, 2) and their ``covariances`` (k, 2, 2).
     """
 
     camera: int
     t_ns: int
     ids: IntArray
     pixels: FloatArray
+    covariances: FloatArray
 
 
-class WayRecord(msgspec.Struct, frozen=True, eq=False):
-    """Data recorded on the path to a stop: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,)."""
+class PathRecord(msgspec.Struct, frozen=True, eq=False):
+    """Data recorded in motion: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,). ``leg``:
+    number of the sweep, 0 on the path to a stop.
+    """
 
-    frames: tuple[WayFrame, ...]
+    frames: tuple[PathFrame, ...]
     joints_ns: IntArray
     positions: FloatArray
+    leg: int = 0
 
 
 class Event(msgspec.Struct, frozen=True, eq=False):
@@ -150,8 +155,8 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     progress: float | None = None
     plan: PlanReport | None = None
     """Of a reply to a goal that was planned."""
-    way: WayRecord | None = None
-    """Of the path to a calibration's stop."""
+    path: PathRecord | None = None
+    """Of a calibration's sweep, or of the path to its stop."""
     loads: JointLoads | None = None
     """Of finished trial motions, if the drives report loads."""
     cameras: tuple[str, ...] = ()

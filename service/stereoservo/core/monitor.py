@@ -66,7 +66,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
-from stereoservo.core.state import CalibrationMotion, CoreState
+from stereoservo.core.state import CoreState, TrialMotion
 from stereoservo.core.target.track import beside_target
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
@@ -224,7 +224,7 @@ def explain_contact(state: CoreState, settings: CoreSettings, room: Workspace) -
     there is no collision.
     """
     block, work = state.block, room.numbers
-    learning = isinstance(state.source, CalibrationMotion)
+    learning = isinstance(state.source, TrialMotion)
     efforts, following = room.sample[2], room.sample[3]
     if learning and work.contact_watched:
         learn_loads(state.source.id, state, np.abs(block.command), efforts, following)  # type: ignore[union-attr]

@@ -31,6 +31,7 @@ from stereoservo.core.sources.law import (
     servo_progress,
     servo_step,
 )
+from stereoservo.core.sources.sweeps import sweeps_step
 from stereoservo.core.state import (
     AwaitingAcknowledgement,
     CalibrationMotion,
@@ -42,6 +43,7 @@ from stereoservo.core.state import (
     JointMove,
     ServoGoal,
     Source,
+    SweepMotion,
 )
 from stereoservo.messages.goals import PlanReport
 from stereoservo.messages.reasons import Reason
@@ -147,6 +149,9 @@ MOTION_SOURCES: dict[type[Any], MotionSource] = {
     ),
     CalibrationMotion: MotionSource(
         "calibrate", trials_step, goal=_id, subject=_id, leased=True, by_images=True, measures=True
+    ),
+    SweepMotion: MotionSource(
+        "calibrate", sweeps_step, goal=_id, subject=_id, leased=True, by_images=True, measures=True
     ),
     CheckMotion: MotionSource(
         "check", check_step, goal=_id, subject=_id, leased=True, by_images=True, measures=True

@@ -54,12 +54,12 @@ from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.law import aim_at, by_kernel, follow_goal
 from stereoservo.core.state import (
-    CalibrationMotion,
     CoreState,
     Holding,
     Leased,
     ServoGoal,
     Source,
+    TrialMotion,
     initial_state,
 )
 from stereoservo.messages.status import Lifecycle
@@ -271,7 +271,7 @@ def arrange(context: StepContext) -> None:
     work, given = room.numbers, room.arrays
     work.active, work.faulty = state.lifecycle is Lifecycle.ACTIVE, state.lifecycle in FAULTY
     work.stopped, work.by_images = state.stopped, kind.by_images
-    work.learning = isinstance(state.source, CalibrationMotion)
+    work.learning = isinstance(state.source, TrialMotion)
     work.rounds_apart = looks_apart(state)
     work.frames_apart = any(state.mobile) or state.target is not None
     work.quiet = watching.last == QUIET and watching.verdict == NOISE

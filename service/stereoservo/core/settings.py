@@ -84,6 +84,8 @@ class TrialSettings(msgspec.Struct, frozen=True, eq=False):
     spread_joint: int = -1
     """Joint that visits ``spread_offsets`` (p,) [rad or m] from its base at the stops of other joints; -1: none."""
     spread_offsets: FloatArray = msgspec.field(default_factory=lambda: np.zeros(1))
+    sweeps: bool = False
+    """Whether the joints sweep without stopping."""
 
 
 class ContactSettings(msgspec.Struct, frozen=True, eq=False):
@@ -381,4 +383,5 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         together=section.together if len(names) > 1 else 0,
         spread_joint=spread_joint,
         spread_offsets=offsets,
+        sweeps=section.motion == "sweeps" and section.spread is None,
     )

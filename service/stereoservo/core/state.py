@@ -12,7 +12,7 @@ from stereoservo.control.faces import FaceChoice, Faces
 from stereoservo.control.filters import ClientClock, TargetTrack
 from stereoservo.core.block import Block, steps_of_delay
 from stereoservo.core.camera_state import CameraEstimate
-from stereoservo.core.cycle import WayFrame
+from stereoservo.core.cycle import PathFrame
 from stereoservo.core.monitor_state import (
     MobileCamera,
     ModelMonitor,
@@ -229,7 +229,7 @@ class PoseMeasurement(Leased, eq=False, kw_only=True):
     """Moves to configurations and measures there at rest; see `core.sources.measure_at_pose`."""
 
     id: str
-    phase: Literal["move", "settle", "collect", "return", "finish"]
+    phase: Literal["move", "settle", "collect", "return", "sweep", "finish"]
     target: FloatArray
     phase_ns: int
     start: FloatArray
@@ -243,7 +243,50 @@ class PoseMeasurement(Leased, eq=False, kw_only=True):
     """Last time at which some camera was known never to have delivered."""
 
 
-class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
+class TrialMotion(PoseMeasurement, eq=False, kw_only=True):
+    """What both programmes of calibration record: the range (n,) ``lowest`` to ``highest`` visited by each joint, its
+    largest motion in the images ``motion_sigmas`` (n,), in sigmas, and ``sigma_px``, the median sigma of a marker at
+    rest. For prediction: sums (n, c, m, 2) of a joint's offset from the base times the markers' motion [rad px or
+    m px], and (n, c, m) of the squared offsets. Of the present path: its frames, and joint samples (n,) at ``path_ns``.
+    """
+
+    base_pixels: FloatArray
+    last: FloatArray
+    lowest: FloatArray
+    highest: FloatArray
+    motion_sigmas: FloatArray
+    sigma_px: float
+    slope_sums: FloatArray
+    slope_weights: FloatArray
+    path_frames: list[PathFrame] = []
+    path_ns: list[int] = []
+    path_joints: list[FloatArray] = []
+
+
+class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):
+    """Calibration by sweeps; see `core.sources.sweeps`.
+
+    ``joint`` sweeps to a ``side``, -1 before the first, their number for all joints at once; ``outward``: away from the
+    base; ``corner``: combinations of offsets tried; ``leg``: number of the sweep, of joint ``trial`` or of all, -1.
+    ``base_pixels``, ``last`` (c, m, 2) [px]: markers at the base and in each camera's last frame, at ``last_ns`` (c,),
+    with ``rates`` (c, m, 2) [px/s].
+    ``recorded``: marker observations not yet sent; ``frames``: of all cameras so far.
+    """
+
+    joint: int
+    side: int
+    outward: bool
+    corner: int
+    leg: int
+    trial: int
+    last_ns: IntArray
+    rates: FloatArray
+    frames: int
+    recorded: int = 0
+    arrived_ns: int = 0
+
+
+class CalibrationMotion(TrialMotion, tag="trials", eq=False, kw_only=True):
     """The calibration programme: joint after joint, stop after stop, then all joints at once (``joint`` is then their
     number). ``k`` counts steps from the base, and the stops of all joints.
 
@@ -264,28 +307,11 @@ class CalibrationMotion(PoseMeasurement, tag="trials", eq=False, kw_only=True):
     turn: int
     """Index of the spread joint's position."""
     seen_turns: int
-    base_pixels: FloatArray
-    last: FloatArray
     last_at: float
     before: FloatArray
     before_at: float
-    lowest: FloatArray
-    highest: FloatArray
-    """Range actually visited, by joint."""
     stops: IntArray
     """Number of stops recorded, by joint."""
-    motion_sigmas: FloatArray
-    """Largest motion in the images between base and a stop, in sigmas, by joint."""
-    sigma_px: float
-    """Median sigma [px] of one marker at a stop."""
-    slope_sums: FloatArray
-    """Sums (n, c, m, 2) over a joint's stops of its offset from the base times the markers' motion [rad px or m px]."""
-    slope_weights: FloatArray
-    """Sums (n, c, m) of the squared offsets."""
-    way_frames: list[WayFrame] = []
-    """Frames on the path to the next stop, with the joint samples (n,) at ``way_ns``."""
-    way_ns: list[int] = []
-    way_joints: list[FloatArray] = []
 
 
 class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):
@@ -364,6 +390,7 @@ Source = (
     | ServoGoal
     | IncidenceGoal
     | CalibrationMotion
+    | SweepMotion
     | CheckMotion
 )
 

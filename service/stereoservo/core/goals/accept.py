@@ -31,10 +31,10 @@ from stereoservo.core.sources.calibration import start_trials
 from stereoservo.core.sources.check import start_check
 from stereoservo.core.sources.joint_move import joint_move_to
 from stereoservo.core.sources.streaming import update
+from stereoservo.core.sources.sweeps import start_sweeps
 from stereoservo.core.sources.teaching import start_teaching
 from stereoservo.core.state import (
     AwaitingAcknowledgement,
-    CalibrationMotion,
     CheckMotion,
     Holding,
     Jogging,
@@ -43,6 +43,7 @@ from stereoservo.core.state import (
     PlanJob,
     ServoGoal,
     Source,
+    TrialMotion,
 )
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
@@ -463,12 +464,10 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
     if MOTION_SOURCES[type(state.source)].measures and goal_of(state.source) == command.id:
         return "already accepted"  # a client's retry
     new_id(command.id, context)
-    visiting: CheckMotion | CalibrationMotion
+    visiting: CheckMotion | TrialMotion
     if not command.check:
-        visiting, what = (
-            start_trials(command.id, context.q, context.now_ns, context.settings),
-            "trial motions begin",
-        )
+        begin = start_sweeps if context.settings.trials.sweeps else start_trials
+        visiting, what = begin(command.id, context.q, context.now_ns, context.settings), "trial motions begin"
     elif state.model is None:
         raise no_model(context, "the cell has no model to check: calibrate first")
     else:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.cycle import Sample, WayFrame, WayRecord
+from stereoservo.core.cycle import PathFrame, PathRecord, Sample
 from stereoservo.core.monitors.collision import learnt_loads
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.measure_at_pose import (
@@ -37,7 +37,7 @@ from stereoservo.core.sources.measure_at_pose import (
 )
 from stereoservo.core.state import CalibrationMotion
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import JointKindName
 
 NO_STEP = 1e-9  # step of a side without planned stops
@@ -63,7 +63,7 @@ def start_trials(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
 def trials_step(trials: CalibrationMotion, context: StepContext) -> SourceOutput:
     """One step of the programme."""
     settings = trial_settings(context.settings)
-    _record_way(trials, context)
+    _record_path(trials, context)
     if trials.phase in ("move", "return", "finish"):
         return _move(trials, context, settings)
     samples = collect_samples(trials, context, settings)
@@ -120,7 +120,7 @@ def _stop_done(
         samples=samples,
         trial=trial,
         progress=_progress(trials, settings),
-        way=_way_record(trials),
+        path=_path_record(trials),
     )
     if not _combining(trials):
         _remember(trials, context, settings, samples, mean)
@@ -128,44 +128,45 @@ def _stop_done(
     return _turn_done(trials, context, settings, "", mean)
 
 
-WAY_FRAMES, WAY_JOINTS, WAY_MARKERS = 200, 2000, 8
+PATH_FRAMES, PATH_JOINTS, PATH_MARKERS = 200, 2000, 8
 """Largest numbers of frames and joint samples kept of one path, and of markers of a frame: enough to measure the delay
 of its stamps.
 """
-WAY_APART_NS = 2_000_000
+PATH_APART_NS = 2_000_000
 """Least time between joint samples that are kept [ns]."""
 
 
-def _record_way(trials: CalibrationMotion, context: StepContext) -> None:
+def _record_path(trials: CalibrationMotion, context: StepContext) -> None:
     """Record the observations on the path to a stop, until its markers are averaged; a path that is too long is not
     recorded.
     """
     cameras = [camera.name for camera in context.settings.cameras]
     for observation in context.observations:
-        if len(trials.way_frames) < WAY_FRAMES and observation.ids.size:
-            chosen = slice(None, None, max(1, -(-observation.ids.size // WAY_MARKERS)))
-            trials.way_frames.append(
-                WayFrame(
+        if len(trials.path_frames) < PATH_FRAMES and observation.ids.size:
+            chosen = slice(None, None, max(1, -(-observation.ids.size // PATH_MARKERS)))
+            trials.path_frames.append(
+                PathFrame(
                     cameras.index(observation.camera),
                     observation.t_shutter_ns,
                     np.asarray(observation.ids[chosen], dtype=np.int64),
                     np.array(observation.pixels[chosen]),
+                    np.array(observation.covariances[chosen]),
                 )
             )
     now_ns = context.state.block.numbers.last_joints_ns
-    due = not trials.way_ns or now_ns - trials.way_ns[-1] >= WAY_APART_NS
-    if due and len(trials.way_ns) < WAY_JOINTS:
-        trials.way_ns.append(now_ns)
-        trials.way_joints.append(context.q.copy())
+    due = not trials.path_ns or now_ns - trials.path_ns[-1] >= PATH_APART_NS
+    if due and len(trials.path_ns) < PATH_JOINTS:
+        trials.path_ns.append(now_ns)
+        trials.path_joints.append(context.q.copy())
 
 
-def _way_record(trials: CalibrationMotion) -> WayRecord | None:
+def _path_record(trials: CalibrationMotion) -> PathRecord | None:
     """The record of the path that ends here; recording restarts for the next one."""
-    frames, times, joints = trials.way_frames, trials.way_ns, trials.way_joints
-    trials.way_frames, trials.way_ns, trials.way_joints = [], [], []
-    if len(times) == WAY_JOINTS or len(frames) < 2:
+    frames, times, joints = trials.path_frames, trials.path_ns, trials.path_joints
+    trials.path_frames, trials.path_ns, trials.path_joints = [], [], []
+    if len(times) == PATH_JOINTS or len(frames) < 2:
         return None
-    return WayRecord(tuple(frames), np.array(times, dtype=np.int64), np.array(joints))
+    return PathRecord(tuple(frames), np.array(times, dtype=np.int64), np.array(joints))
 
 
 def _remember(
@@ -545,6 +546,8 @@ MIN_MOTION_SIGMAS = 40.0
 PROBE: dict[JointKindName, float] = {"revolute": 0.02, "prismatic": 0.005}  # [rad, m]
 BORDER = 0.03
 """Margin to the border of a view, as a fraction of its width."""
+BRAKING = 0.6
+"""Fraction of the acceleration limit with which a sweep that must end is braked."""
 KEPT = 0.75
 """Fraction of the markers seen at the base that must remain inside; never fewer than ``min_markers``."""
 
@@ -599,13 +602,19 @@ def _needed(seen: int, settings: TrialSettings) -> int:
 
 def enough_inside(pixels: FloatArray, core: CoreSettings, settings: TrialSettings) -> bool:
     """Whether enough of the markers (p, c, m, 2) are inside every view by a margin; NaN: not seen, not counted."""
+    return bool(inside_by_margin(pixels, core, settings).all())
+
+
+def inside_by_margin(pixels: FloatArray, core: CoreSettings, settings: TrialSettings) -> BoolArray:
+    """For which of the positions (p,) enough of the markers (p, c, m, 2) are inside every view by a margin."""
+    enough = np.ones(len(pixels), dtype=bool)
     for c, camera in enumerate(core.cameras):
-        inside = _inside(pixels[:, c], camera.width, camera.height)
         known = np.isfinite(pixels[:, c]).all(axis=-1)
-        for seen, kept in zip(known.sum(axis=-1), (inside & known).sum(axis=-1), strict=True):
-            if seen and kept < _needed(int(seen), settings):
-                return False
-    return True
+        kept = (_inside(pixels[:, c], camera.width, camera.height) & known).sum(axis=-1)
+        seen = known.sum(axis=-1)
+        needed = np.maximum(settings.min_markers, np.ceil(KEPT * seen))
+        enough &= (seen == 0) | (kept >= needed)
+    return enough
 
 
 def _inside(pixels: FloatArray, width: int, height: int) -> npt.NDArray[np.bool_]:

@@ -114,7 +114,7 @@ FIRST_FRAME_S = 120.0  # a camera that has never delivered may still be starting
 LOST_S = 0.4  # markers missing for so long in motion: back off
 AT_REST = 0.01  # [rad/s or m/s]
 
-Phase = Literal["move", "settle", "collect", "return", "finish"]
+Phase = Literal["move", "settle", "collect", "return", "sweep", "finish"]
 
 
 def trial_settings(settings: CoreSettings) -> TrialSettings:

@@ -1,5 +1,5 @@
-"""Collects the ``calibration_sample`` events of the calibration motion (mean marker pixels at each stop) into trial
-data for the fit.
+"""Collects the events of the calibration motion (mean marker pixels at each stop, frames of each sweep) into trial data
+for the fit.
 """
 
 from __future__ import annotations
@@ -7,10 +7,12 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.calibration.static_points import static_markers, static_observations
-from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations
-from stereoservo.core.cycle import Event
+from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, stamp_delays
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations, finite_rows
+from stereoservo.core.cycle import Event, PathFrame, PathRecord
 from stereoservo.core.settings import CameraSettings, CoreSettings
 from stereoservo.kinematics.model import JointLoads
+from stereoservo.numerics.arrays import FloatArray
 
 LEAST_NOISE = 1e-9
 """Fraction of a variance below which noise is only the rounding error of a difference."""
@@ -27,6 +29,7 @@ class TrialCollector:
         self._settings = settings
         self.id = ""
         self._stops: list[Event] = []
+        self._sweeps: list[Event] = []
         self.standing: tuple[int, ...] = ()
         self.strayed: tuple[int, ...] = ()
         self._loads: JointLoads | None = None
@@ -36,17 +39,25 @@ class TrialCollector:
         """Number of stops collected so far."""
         return len(self._stops)
 
+    @property
+    def frames(self) -> int:
+        """Number of frames of sweeps collected so far."""
+        return sum(len(event.path.frames) for event in self._sweeps if event.path is not None)
+
     def add(self, event: Event) -> None:
-        """Add an event: ``calibration_sample``, or ``calibration_finished`` with the joints' loads."""
+        """Add an event: ``calibration_sample``, ``calibration_frames``, or ``calibration_finished`` with the joints'
+        loads.
+        """
         if event.kind == "calibration_finished" and event.id == self.id:
             self._loads = event.loads
-        if event.kind != "calibration_sample":
+        if event.kind not in ("calibration_sample", "calibration_frames"):
             return
         if event.id != self.id:
             self.id = event.id
             self._stops.clear()
+            self._sweeps.clear()
             self._loads = None
-        self._stops.append(event)
+        (self._stops if event.kind == "calibration_sample" else self._sweeps).append(event)
 
     def trials(self) -> TrialData:
         """All stops as trial data, without markers that no camera ever saw or that are static (``standing``).
@@ -59,24 +70,36 @@ class TrialCollector:
                 "too_few_stops", "the trial motions gave no stop; at least 4 a joint are needed", stops=0
             )
         settings = self._settings
-        seen = {int(i) for event in self._stops for sample in event.samples for i in sample.ids}
-        markers = tuple(marker for marker in settings.marker_ids if marker in seen)
-        column = {marker: k for k, marker in enumerate(markers)}
-        row = {camera.name: c for c, camera in enumerate(settings.cameras)}
-        shape = (len(settings.cameras), len(self._stops), len(markers))
-        pixels = np.full((*shape, 2), np.nan)
-        sigmas = np.full(shape, np.nan)
-        images = 0
-        factors = {camera.name: self._noise_factor(camera) for camera in settings.cameras}
+        legs = self._legs()
+        means = _means_of_legs(legs, settings)
+        cameras = settings.cameras
+        column = {marker: k for k, marker in enumerate(settings.marker_ids)}
+        row = {camera.name: c for c, camera in enumerate(cameras)}
+        factors = [self._noise_factor(camera, means) for camera in cameras]
+        shape = (len(cameras), len(self._stops), len(column))
+        pixels, sigmas = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
+        images = sum(int(of_leg.frames.sum()) for _, of_leg in means)
         for s, event in enumerate(self._stops):
             for sample in event.samples:
                 images += sample.frames
-                for marker, pixel, covariance in zip(sample.ids, sample.pixels, sample.covariances, strict=True):
-                    where = row[sample.camera], s, column[int(marker)]
-                    pixels[where] = pixel
-                    systematic = settings.cameras[where[0]].systematic_px ** 2
-                    noise = 0.5 * np.trace(covariance) - systematic
-                    sigmas[where] = np.sqrt(factors[sample.camera] * noise + systematic)
+                c = row[sample.camera]
+                at = [column[i] for i in sample.ids.tolist()]
+                noise = 0.5 * np.trace(sample.covariances, axis1=1, axis2=2) - cameras[c].systematic_px ** 2
+                pixels[c, s, at] = sample.pixels
+                sigmas[c, s, at] = np.sqrt(factors[c] * noise + cameras[c].systematic_px ** 2)
+        positions = [np.array([_joints(event) for event in self._stops])]
+        trials = [np.array([event.trial for event in self._stops], dtype=np.int64)]
+        for leg, of_leg in means:
+            systematic = np.array([camera.systematic_px**2 for camera in cameras])[:, None, None]
+            noise = (of_leg.single - systematic) / np.maximum(of_leg.counts, 1.0)
+            of_cameras = np.array(factors)[:, None, None]
+            pixels = np.concatenate([pixels, of_leg.pixels], axis=1)
+            sigmas = np.concatenate([sigmas, np.sqrt(of_cameras * noise + systematic)], axis=1)
+            positions.append(of_leg.positions)
+            trials.append(np.full(len(of_leg.positions), leg.trial, dtype=np.int64))
+        ever = np.asarray(finite_rows(pixels).any(axis=(0, 1)))
+        markers = tuple(marker for marker, some in zip(settings.marker_ids, ever.tolist(), strict=True) if some)
+        pixels, sigmas = pixels[:, :, ever], sigmas[:, :, ever]
         declared = np.array([marker in settings.scene_ids for marker in markers], dtype=bool)
         static, self.strayed = static_observations(
             tuple(marker for marker in markers if marker in settings.scene_ids),
@@ -96,19 +119,20 @@ class TrialCollector:
                 TrialCamera(camera.name, camera.width, camera.height, camera.mount) for camera in settings.cameras
             ),
             marker_ids=markers,
-            positions=np.array([_joints(event) for event in self._stops]),
-            trials=np.array([event.trial for event in self._stops], dtype=np.int64),
+            positions=np.concatenate(positions),
+            trials=np.concatenate(trials),
             pixels=pixels[:, :, ~still],
             sigmas=sigmas[:, :, ~still],
             images=images,
             loads=self._loads,
             static=static,
-            way=self._way(),
+            way=self._paths(),
         )
 
-    def _way(self) -> WayObservations | None:
-        """Observations between the stops; None if there are none."""
-        records = [(k, event.way) for k, event in enumerate(self._stops) if event.way is not None]
+    def _paths(self) -> WayObservations | None:
+        """Observations between the stops and on the sweeps; None if there are none."""
+        records = [(k, event.path) for k, event in enumerate(self._stops) if event.path is not None]
+        records += [(event.path.leg, event.path) for event in self._sweeps if event.path is not None]
         frames = [(k, frame) for k, record in records for frame in record.frames]
         if not frames:
             return None
@@ -130,7 +154,39 @@ class TrialCollector:
             positions=np.concatenate([record.positions for _, record in records]),
         )
 
-    def _noise_factor(self, camera: CameraSettings) -> float:
+    def _legs(self) -> list[Leg]:
+        """The sweeps. A frame belongs to the sweep in which it is stamped, whenever it arrived."""
+        records = [(event.trial, event.path) for event in self._sweeps if event.path is not None]
+        if not records:
+            return []
+        start_ns = int(records[0][1].joints_ns[0])  # clock of this boot: relative seconds keep their precision
+        times = np.concatenate([1e-9 * (record.joints_ns - start_ns) for _, record in records])
+        positions = np.concatenate([record.positions for _, record in records])
+        trial_of = {record.leg: trial for trial, record in records}
+        starts = {leg: 1e-9 * (_first_ns(records, leg) - start_ns) for leg in trial_of}
+        order = sorted(starts)
+        frames = sorted((frame for _, record in records for frame in record.frames), key=lambda frame: frame.t_ns)
+        legs = []
+        for leg, following in zip(order, [*order[1:], None], strict=True):
+            begin, end = starts[leg], float(times[-1]) if following is None else starts[following]
+            mine = [frame for frame in frames if begin <= 1e-9 * (frame.t_ns - start_ns) < end]
+            around = (times >= begin - LONGEST_DELAY_S) & (times <= end + LONGEST_DELAY_S)
+            observed = [
+                _observations(mine, camera, start_ns, self._settings) for camera in range(len(self._settings.cameras))
+            ]
+            legs.append(
+                Leg(
+                    trial_of[leg],
+                    begin,
+                    end,
+                    times[around],
+                    positions[around],
+                    *(tuple(o[k] for o in observed) for k in range(3)),
+                )
+            )
+        return legs
+
+    def _noise_factor(self, camera: CameraSettings, means: list[tuple[Leg, LegMeans]]) -> float:
         """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum likelihood
         over all stops, the mean of the ratios by degrees of freedom.
 
@@ -140,11 +196,15 @@ class TrialCollector:
         detector states no noise.
         """
         samples = [sample for event in self._stops for sample in event.samples if sample.camera == camera.name]
-        if not samples:
+        c = self._settings.cameras.index(camera)
+        of_legs = [_scatter(of_leg, c, camera.systematic_px**2) for _, of_leg in means]
+        if not samples and not of_legs:
             return 1.0
-        frame_counts = np.concatenate([sample.sights for sample in samples])
-        scatter = np.concatenate([sample.scatter for sample in samples])
-        variance = np.concatenate([0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples])
+        frame_counts = np.concatenate([*(sample.sights for sample in samples), *(one[0] for one in of_legs)])
+        scatter = np.concatenate([*(sample.scatter for sample in samples), *(one[1] for one in of_legs)])
+        variance = np.concatenate(
+            [*(0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples), *(one[2] for one in of_legs)]
+        )
         noise = variance - camera.systematic_px**2
         single = noise * frame_counts
         known = (noise > LEAST_NOISE * variance) & (frame_counts > 1.0)
@@ -153,6 +213,43 @@ class TrialCollector:
         known &= single <= MOST_NOISE * np.median(single[known])
         factor = float(np.average(scatter[known] / single[known], weights=frame_counts[known] - 1.0))
         return factor if factor > 0.0 else 1.0
+
+
+def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, LegMeans]]:
+    """The sweeps with their means, each of as many frames as are averaged at a stop, at the cameras' own delays."""
+    if not legs or settings.trials is None:
+        return []
+    delays, _ = stamp_delays(legs, len(settings.cameras))
+    found = [(leg, leg_means(leg, delays, settings.trials.frames)) for leg in legs]
+    return [(leg, means) for leg, means in found if means is not None]
+
+
+def _first_ns(records: list[tuple[int, PathRecord]], leg: int) -> int:
+    return min(int(record.joints_ns[0]) for _, record in records if record.leg == leg)
+
+
+def _observations(
+    frames: list[PathFrame], camera: int, start_ns: int, settings: CoreSettings
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Stamps (f,) [s] of a camera's frames, pixels (f, m, 2) and variances (f, m) of the cell's markers in them."""
+    mine = [frame for frame in frames if frame.camera == camera]
+    column = {marker: i for i, marker in enumerate(settings.marker_ids)}
+    pixels = np.full((len(mine), len(column), 2), np.nan)
+    variances = np.full((len(mine), len(column)), np.nan)
+    for f, frame in enumerate(mine):
+        known = [k for k, marker in enumerate(frame.ids.tolist()) if marker in column]
+        at = [column[int(frame.ids[k])] for k in known]
+        pixels[f, at] = frame.pixels[known]
+        variances[f, at] = 0.5 * np.trace(frame.covariances[known], axis1=1, axis2=2)
+    return np.array([1e-9 * (frame.t_ns - start_ns) for frame in mine]), pixels, variances
+
+
+def _scatter(means: LegMeans, camera: int, systematic: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Of a camera's markers on a sweep: degrees of freedom plus one, scatter, and the variance of a mean of as many."""
+    known = means.freedom[camera] > 0.0
+    counts = means.freedom[camera, known] + 1.0
+    single = np.nanmean(means.single[camera][:, known], axis=0)
+    return counts, means.scatter[camera, known], (single - systematic) / counts + systematic
 
 
 def _joints(event: Event) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -1,0 +1,316 @@
+"""Trial data from sweeps: frames taken while joints move are reduced to means at a few positions along each sweep.
+
+On a leg, a straight line in joint space, a marker's track in an image is a smooth function of the joint position at the
+shutter. A polynomial describes its curvature; the frames of an interval are averaged about the polynomial, so that a
+mean has the noise of as many frames at rest. All cameras are reduced at the same positions, whatever their stamps.
+
+The delay of a camera's stamps against the joints' follows from the same tracks without a model: with a delay, markers
+are displaced in proportion to the joint's velocity; with play, by a constant that changes its sign with the direction.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from scipy.stats import f as f_distribution
+
+from stereoservo.calibration.trial_data import finite_rows
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+
+FEWEST_TERMS, MOST_TERMS, MORE_TERMS = 3, 10, 2
+"""Range of the number of a track's polynomial terms that the data show, and how many more are used: what is left out
+would be an error that all markers share.
+"""
+LEAST_FREEDOM, FEWEST_FRAMES_OF_LEG = 3, 12
+"""Least degrees of freedom that are left beside them, and least number of a camera's frames on a leg."""
+FAR_SIGMAS = 6.0
+"""Residual of an observation, in robust deviations of its track, above which it is a wrong detection."""
+LINE = 0.5, 0.95
+"""Fractions of a leg's time at which it is on its line: it begins before the one before has ended."""
+STRAIGHT = 1e-3
+"""Largest deviation of a joint from a leg's line, as a fraction of half the leg, in a frame that is used."""
+ROUNDS = 6
+LONGEST_DELAY_S = 0.3
+CONVERGED_S = 1e-6
+FALSE_ALARM = 1e-4
+"""Probability of finding play in joints that have none."""
+STILL, MOST_OTHERS = 1e-6, 3
+"""Motion of other joints [rad or m, rms] that is taken into account, and most directions of it."""
+DELAY_TERMS = 10
+"""Most polynomial terms of a joint's tracks, there and back, beside the delay."""
+FEWEST_FRAMES = 12
+"""Least number of a camera's frames with a joint in motion from which its delay is estimated."""
+
+
+class Leg(msgspec.Struct, frozen=True, eq=False):
+    """Observations on one leg, from ``start_s`` to ``end_s``. ``trial``: the joint that moves alone, -1 if several do.
+
+    Joint samples, before and after the leg as well: ``joint_times`` (j,) [s], ``positions`` (j, n). For each camera its
+    frames: ``times`` (f,) [s] as stamped, ``pixels`` (f, m, 2) raw, NaN where a marker is not seen, ``variances``
+    (f, m) [px²] of a coordinate, as stated.
+    """
+
+    trial: int
+    start_s: float
+    end_s: float
+    joint_times: FloatArray
+    positions: FloatArray
+    times: tuple[FloatArray, ...]
+    pixels: tuple[FloatArray, ...]
+    variances: tuple[FloatArray, ...]
+
+    def positions_at(self, times: FloatArray) -> FloatArray:
+        """Joint positions (f, n) at ``times`` (f,) [s], by linear interpolation."""
+        return np.array([np.interp(times, self.joint_times, q) for q in self.positions.T]).T
+
+    @property
+    def ends(self) -> FloatArray:
+        """Joint positions (2, n) at its start and its end."""
+        return self.positions_at(np.array([self.start_s, self.end_s]))
+
+
+class LegMeans(NamedTuple):
+    """Means at k positions of a leg: ``positions`` (k, n), ``pixels`` (c, k, m, 2), NaN where there are none; each of
+    ``counts`` (c, k, m) observations, of which one has the variance ``single`` (c, k, m) [px²], as stated.
+
+    ``frames`` (c,): how many there were. ``scatter`` (c, m) [px²]: variance of a coordinate about the track, with
+    ``freedom`` (c, m).
+    """
+
+    positions: FloatArray
+    pixels: FloatArray
+    counts: FloatArray
+    single: FloatArray
+    frames: IntArray
+    scatter: FloatArray
+    freedom: FloatArray
+
+
+def leg_means(leg: Leg, delays: FloatArray, frames_each: int) -> LegMeans | None:
+    """Means of a leg over intervals of ``frames_each`` frames, with the cameras' shutters ``delays`` (c,) [s] after
+    their stamps; None if the leg has too few frames or no motion.
+    """
+    shown = [leg.positions_at(times + delay) for times, delay in zip(leg.times, delays.tolist(), strict=True)]
+    middle, end = leg.positions_at(leg.start_s + np.array(LINE) * (leg.end_s - leg.start_s))
+    line = end - middle
+    if not line.any():
+        return None
+    along = [(q - middle) @ line / (line @ line) for q in shown]
+    straight = [_near_line(q - middle, a, line) for q, a in zip(shown, along, strict=True)]
+    most = max((a[near] for a, near in zip(along, straight, strict=True)), key=len)
+    if len(most) < max(frames_each, FEWEST_FRAMES_OF_LEG):
+        return None
+    edges = np.quantile(most, np.linspace(0.0, 1.0, len(most) // frames_each + 1))
+    inner = edges[1:-1]
+    intervals = [np.where(near, np.searchsorted(inner, a), -1) for a, near in zip(along, straight, strict=True)]
+    every, of_interval, q_all = np.concatenate(along), np.concatenate(intervals), np.concatenate(shown)
+    used = np.unique(of_interval[of_interval >= 0])
+    nodes = np.array([every[of_interval == k].mean() for k in used])
+    positions = np.array([q_all[of_interval == k].mean(axis=0) for k in used])
+    c, m = len(leg.times), leg.pixels[0].shape[1]
+    pixels, single = np.full((c, len(used), m, 2), np.nan), np.full((c, len(used), m), np.nan)
+    counts, scatter, freedom = np.zeros((c, len(used), m)), np.zeros((c, m)), np.zeros((c, m))
+    for camera in range(c):
+        seen = finite_rows(leg.pixels[camera]) & straight[camera][:, None]
+        terms = MORE_TERMS + _terms(along[camera], leg.pixels[camera], seen)
+        for marker in np.flatnonzero(seen.sum(axis=0) >= frames_each):
+            track = _track(along[camera], leg.pixels[camera][:, marker], seen[:, marker], terms)
+            scatter[camera, marker], freedom[camera, marker] = track.scatter, track.freedom
+            for row, (k, node) in enumerate(zip(used.tolist(), nodes.tolist(), strict=True)):
+                mine = track.used & (intervals[camera] == k)
+                if not mine.any() or 2 * int(mine.sum()) < int((intervals[camera] == k).sum()):
+                    continue
+                weights = track.weights(along[camera], mine, node)
+                pixels[camera, row, marker] = weights @ leg.pixels[camera][track.used, marker]
+                single[camera, row, marker] = leg.variances[camera][mine, marker].mean()
+                counts[camera, row, marker] = 1.0 / float(weights @ weights)
+    frames = np.array([int(near.sum()) for near in straight], dtype=np.int64)
+    return LegMeans(positions, pixels, counts, single, frames, scatter, freedom)
+
+
+def _near_line(offsets: FloatArray, along: FloatArray, line: FloatArray) -> BoolArray:
+    """Mask (f,) of joint positions near a leg's line."""
+    aside = np.abs(offsets - along[:, None] * line).max(axis=1)
+    return np.asarray(aside <= STRAIGHT * np.abs(line).max())
+
+
+class _Track(NamedTuple):
+    """Polynomial of a marker's track, in ``terms`` over [low, high]: its ``used`` observations (f,), the
+    ``inverse`` (terms, k) of their columns, their ``scatter`` about it [px²] and its degrees of ``freedom``, of one
+    coordinate.
+    """
+
+    terms: int
+    low: float
+    high: float
+    used: BoolArray
+    inverse: FloatArray
+    scatter: float
+    freedom: float
+
+    def weights(self, along: FloatArray, mine: BoolArray, node: float) -> FloatArray:
+        """Weights (k,) of the used observations in their mean over ``mine`` (f,), moved along the polynomial to
+        ``node``.
+        """
+        columns = _columns(np.append(along[mine], node), self.low, self.high, self.terms)
+        weights: FloatArray = (columns[-1] - columns[:-1].mean(axis=0)) @ self.inverse
+        weights[mine[self.used]] += 1.0 / mine.sum()
+        return weights
+
+
+def _columns(along: FloatArray, low: float, high: float, count: int) -> FloatArray:
+    """Chebyshev polynomials (k, count) over [low, high]."""
+    scaled = 2.0 * (along - low) / max(high - low, 1e-12) - 1.0
+    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, count - 1), dtype=np.float64)
+
+
+def _terms(along: FloatArray, pixels: FloatArray, seen: BoolArray) -> int:
+    """Number of polynomial terms for the tracks (f, m, 2) of a camera's markers: the one with the least of Akaike's
+    criterion, corrected for few observations, among those that leave freedom.
+    """
+    masks, of_mask = np.unique(seen, axis=1, return_inverse=True)
+    best, chosen = np.inf, FEWEST_TERMS
+    for terms in range(FEWEST_TERMS, MOST_TERMS + 1):
+        cost = 0.0
+        for k, mask in enumerate(masks.T):
+            count = int(mask.sum())
+            if count < FEWEST_TERMS + LEAST_FREEDOM:
+                continue
+            if count < terms + LEAST_FREEDOM:
+                return chosen
+            basis, _ = np.linalg.qr(_columns(along[mask], float(along[mask].min()), float(along[mask].max()), terms))
+            tracks = pixels[mask][:, of_mask.ravel() == k].reshape(count, -1)
+            squares = ((tracks - basis @ (basis.T @ tracks)) ** 2).sum()
+            cost += tracks.shape[1] * (
+                count * np.log(max(float(squares), 1e-300)) + 2.0 * terms * count / (count - terms - 1.0)
+            )
+        if cost < best:
+            best, chosen = cost, terms
+    return chosen
+
+
+def _track(along: FloatArray, pixels: FloatArray, seen: BoolArray, terms: int) -> _Track:
+    """Fit of one marker's track (f, 2) by a polynomial, without wrong detections."""
+    used = seen.copy()
+    while True:
+        low, high = float(along[used].min()), float(along[used].max())
+        count = max(1, min(terms, int(used.sum()) - LEAST_FREEDOM))
+        columns = _columns(along[used], low, high, count)
+        inverse = np.asarray(np.linalg.pinv(columns), dtype=np.float64)
+        squares = ((pixels[used] - columns @ (inverse @ pixels[used])) ** 2).sum(axis=1)
+        freedom = float(len(columns) - count)
+        limit = FAR_SIGMAS**2 * max(float(np.median(squares)) / np.log(2.0), 1e-12)  # chi² of two coordinates
+        wrong = squares > limit
+        if not wrong.any() or freedom <= LEAST_FREEDOM:
+            scatter = float(squares.sum()) / (2.0 * freedom) if freedom else 0.0
+            return _Track(count, low, high, used, inverse, scatter, freedom)
+        used[np.flatnonzero(used)[wrong]] = False
+
+
+def stamp_delays(legs: list[Leg], cameras: int) -> tuple[FloatArray, FloatArray]:
+    """Delay (c,) [s] of the cameras' shutters after their stamps, by legs on which a joint moves alone, there and back,
+    and its standard deviation (c,); 0 and infinite where these do not determine it.
+    """
+    pairs = [[leg for leg in legs if leg.trial == joint] for joint in sorted({leg.trial for leg in legs} - {-1})]
+    found = [_stamp_delay(pairs, camera) for camera in range(cameras)]
+    return np.array([delay for delay, _ in found]), np.array([deviation for _, deviation in found])
+
+
+class _Delay(NamedTuple):
+    """A delay [s] and its standard deviation, the sum of ``squares`` that it leaves, and degrees of ``freedom``."""
+
+    delay: float
+    deviation: float
+    squares: float
+    freedom: float
+
+
+def _stamp_delay(pairs: list[list[Leg]], camera: int) -> tuple[float, float]:
+    """Delay of a camera and its deviation: with joints that have play only if that explains the tracks better, because
+    play and delay are similar where the speed is constant.
+    """
+    exact, play = (_fitted_delay(pairs, camera, play=play) for play in (False, True))
+    more = exact.freedom - play.freedom
+    if not np.isfinite(exact.deviation) or play.freedom <= 0.0 or more <= 0.0:
+        return exact.delay, exact.deviation
+    ratio = (exact.squares - play.squares) / more / max(play.squares / play.freedom, 1e-300)
+    chosen = play if ratio > float(f_distribution.isf(FALSE_ALARM, more, play.freedom)) else exact
+    return chosen.delay, chosen.deviation
+
+
+def _fitted_delay(pairs: list[list[Leg]], camera: int, *, play: bool) -> _Delay:
+    found = _Delay(0.0, np.inf, 0.0, 0.0)
+    for _ in range(ROUNDS):
+        equations = [_delay_equation(legs, camera, found.delay, play=play) for legs in pairs]
+        across, square, squares, freedom = (sum(one[k] for one in equations) for k in range(4))
+        if not square > 0.0 or freedom <= 1.0:
+            return _Delay(0.0, np.inf, 0.0, 0.0)
+        step = across / square
+        delay = float(np.clip(found.delay + step, -LONGEST_DELAY_S, LONGEST_DELAY_S))
+        left = max(squares - across * step, 0.0)
+        found = _Delay(delay, float(np.sqrt(left / freedom / square)), left, freedom)
+        if abs(step) < CONVERGED_S:
+            break
+    return found
+
+
+def _delay_equation(legs: list[Leg], camera: int, delay: float, *, play: bool) -> tuple[float, float, float, float]:
+    """Normal equation of a further delay from the legs of one joint: right side, square, sum of squared residuals at
+    ``delay``, and degrees of freedom. Tracks are polynomials of the joint; ``play``: displaced by its direction.
+    """
+    times = [leg.times[camera] for leg in legs]
+    if sum(len(t) for t in times) < FEWEST_FRAMES:
+        return 0.0, 0.0, 0.0, 0.0
+    joint = legs[0].trial
+    positions = np.concatenate([leg.positions_at(t + delay) for leg, t in zip(legs, times, strict=True)])
+    shown, aside = positions[:, joint], _others(np.delete(positions, joint, axis=1))
+    speed = np.concatenate([np.interp(t + delay, *_speeds(leg, joint)) for leg, t in zip(legs, times, strict=True)])
+    ahead = np.concatenate(
+        [
+            np.full(len(t), np.sign(leg.positions[-1, joint] - leg.positions[0, joint]))
+            for leg, t in zip(legs, times, strict=True)
+        ]
+    )
+    pixels = np.concatenate([leg.pixels[camera] for leg in legs])
+    low, high = float(shown.min()), float(shown.max())
+    across, square, squares, freedom = 0.0, 0.0, 0.0, 0.0
+    seen = finite_rows(pixels)
+    for mask in np.unique(seen, axis=1).T:
+        count = min(DELAY_TERMS, int(mask.sum()) // 3)
+        if mask.sum() < FEWEST_FRAMES:
+            continue
+        mine = (seen == mask[:, None]).all(axis=0)
+        columns = np.column_stack(
+            [_columns(shown[mask], low, high, count), aside[mask], *((ahead[mask],) if play else ())]
+        )
+        slopes = np.polynomial.chebyshev.chebder(np.eye(count)) if count > 1 else np.zeros((0, count))
+        basis, _ = np.linalg.qr(columns)
+        tracks = pixels[mask][:, mine].reshape(int(mask.sum()), -1)
+        coefficients, *_ = np.linalg.lstsq(columns, tracks, rcond=None)
+        left = tracks - basis @ (basis.T @ tracks)
+        rates = _columns(shown[mask], low, high, max(count - 1, 1)) @ (slopes @ coefficients[:count])
+        rates *= (2.0 / max(high - low, 1e-12)) * speed[mask, None]
+        rates -= basis @ (basis.T @ rates)
+        across += float((rates * left).sum())
+        square += float((rates * rates).sum())
+        squares += float((left * left).sum())
+        freedom += float(left.size - columns.shape[1] * left.shape[1])
+    return across, square, squares, freedom
+
+
+def _others(positions: FloatArray) -> FloatArray:
+    """Motion (f, k) of the other joints, ``positions`` (f, n - 1), in its principal directions: one that has just swept
+    is still arriving.
+    """
+    offsets = positions - np.median(positions, axis=0)
+    basis, sizes, _ = np.linalg.svd(offsets, full_matrices=False)
+    return np.asarray(basis[:, sizes > STILL * np.sqrt(len(offsets))][:, :MOST_OTHERS])
+
+
+def _speeds(leg: Leg, joint: int) -> tuple[FloatArray, FloatArray]:
+    """Times between the joint samples, and the joint's speeds there."""
+    times, q = leg.joint_times, leg.positions[:, joint]
+    steps = np.maximum(np.diff(times), 1e-9)
+    return 0.5 * (times[1:] + times[:-1]), np.diff(q) / steps
