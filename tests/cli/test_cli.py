@@ -388,7 +388,7 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch, run: Run) 
     def interrupted() -> list[Any]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stereoservo.cli.ls.live_cells", interrupted)
+    monkeypatch.setattr("stereoservo.cli.status.live_cells", interrupted)
     code, result, _ = run("ls")
     assert (code, result["error"]["code"]) == (130, "interrupted")
 
@@ -396,7 +396,7 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch, run: Run) 
 def test_an_unexpected_error_shows_its_traceback_and_still_one_json_object(
     monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
-    monkeypatch.setattr("stereoservo.cli.ls.live_cells", lambda: 1 / 0)
+    monkeypatch.setattr("stereoservo.cli.status.live_cells", lambda: 1 / 0)
     code, result, err = run("ls")
     assert code == 1
     assert result["error"]["message"] == "division by zero"

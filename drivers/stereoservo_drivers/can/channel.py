@@ -19,8 +19,7 @@ import msgspec
 
 from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanRefusedError
 from stereoservo_drivers.can.slcan_lines import flags_in_words
 

@@ -30,7 +30,7 @@ from stereoservo_drivers.kit.bench import (
     told,
     zero,
 )
-from stereoservo_drivers.kit.watchdog import StallWatch
+from stereoservo_drivers.kit.timing import StallWatch
 
 # -- of the life cycle ---------------------------------------------------------------------------------------
 # Checks of joint drivers that hardly move the arm: description, lifecycle, samples.

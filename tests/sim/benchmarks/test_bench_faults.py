@@ -14,7 +14,7 @@ from rich.console import Console
 
 from stereoservo.cli import main as cli
 from stereoservo_sim.benchmarks.faults import bench, inputs, service
-from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
+from stereoservo_sim.benchmarks.faults.bench import distinct_sentences, reliability_page
 from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
 
 

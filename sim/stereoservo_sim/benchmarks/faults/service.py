@@ -25,7 +25,7 @@ import numpy as np
 
 from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
-from stereoservo_drivers.kit.watchdog import StallWatch
+from stereoservo_drivers.kit.timing import StallWatch
 from stereoservo_sim.benchmarks import service_bench
 from stereoservo_sim.benchmarks.service_bench import (
     CELL,

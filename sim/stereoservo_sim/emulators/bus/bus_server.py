@@ -18,8 +18,7 @@ from typing import Any, Protocol, Self
 import msgspec
 
 from stereoservo.messages.addresses import Address
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator, BusEvent

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from stereoservo_sim.emulators.bus.fault_cases import CASES, CIA402_CASES, FaultCase
-from stereoservo_sim.emulators.bus.fault_table import run_row, sum_up, trial_rng
-from stereoservo_sim.emulators.bus.fault_trials import FaultRig, Trial, run_trial, trial_speed
+from stereoservo_sim.emulators.bus.fault_trials import (
+    FaultRig,
+    Trial,
+    run_row,
+    run_trial,
+    sum_up,
+    trial_rng,
+    trial_speed,
+)
 
 ALL = [
     pytest.param(protocol, case, id=f"{protocol}: {case.name}") for protocol, cases in CASES.items() for case in cases

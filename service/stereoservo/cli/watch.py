@@ -20,8 +20,8 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
 if TYPE_CHECKING:
-    from stereoservo.cli.watch.foxglove_server import FoxgloveServer
-    from stereoservo.cli.watch.rerun_viewer import RerunViewer
+    from stereoservo.cli.foxglove_server import FoxgloveServer
+    from stereoservo.cli.rerun_viewer import RerunViewer
 
 STATE_EVERY_S = 1.0
 RUNTIME = "(rx: (handover: app), app: (worker_threads: 1))"
@@ -76,7 +76,7 @@ def _viewers(
     """The requested viewers; ``opened`` closes them."""
     found: list[FoxgloveServer | RerunViewer] = []
     if port is not None:
-        from stereoservo.cli.watch.foxglove_server import (
+        from stereoservo.cli.foxglove_server import (
             FoxgloveServer,
         )  # of the extra `cell`: only for this
 
@@ -84,7 +84,7 @@ def _viewers(
         note(f"in Foxglove: Open connection, ws://localhost:{server.port}")
         found.append(server)
     if rerun:
-        from stereoservo.cli.watch.rerun_viewer import RerunViewer  # of the extra `watch`: only for this
+        from stereoservo.cli.rerun_viewer import RerunViewer  # of the extra `watch`: only for this
 
         found.append(opened.enter_context(RerunViewer(cell, save)))
     return found
