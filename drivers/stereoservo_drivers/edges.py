@@ -40,7 +40,7 @@ MOST_SAMPLES = 120
 """Largest number of profiles per edge."""
 LEAST_SAMPLES = 8
 """Least number of places on a line; with fewer it is not measured."""
-LEAST_SHARE = 0.65
+LEAST_POINT_SHARE = 0.65
 """Least share of an edge's profiles with a place on its line."""
 OFF_LINE = 3.0
 """Number of standard deviations beyond which a place is not on the line."""
@@ -187,7 +187,7 @@ def measure_lines(
         for row, sign in enumerate((-1.0, 1.0)):
             fit_line(places, sign, half, reach, fits[row])
         best = fits[int(fits[1, 0] > fits[0, 0])]
-        if best[0] < LEAST_SHARE * own.sum():
+        if best[0] < LEAST_POINT_SHARE * own.sum():
             continue
         along = (b - a) / (2.0 * half)
         lines[number] = MeasuredLine(

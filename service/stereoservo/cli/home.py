@@ -13,11 +13,10 @@ from stereoservo.cli import interruption
 from stereoservo.cli.goal import follow
 from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
 from stereoservo.cli.output import (
+    CELL_OPTIONS,
     CellArgument,
+    CellOptions,
     CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
     emit,
     note,
     note_hold,
@@ -64,9 +63,7 @@ def home(
         bool, typer.Option("--check", help="With --by-vision: only tell the zeros; nothing moves.")
     ] = False,
     speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Move every joint to the cell's home position. Ctrl-C cancels.
 
@@ -75,15 +72,15 @@ def home(
     """
     if check and not by_vision:
         raise CommandError("usage", "--check goes with --by-vision; without pictures `home` has nothing to tell")
-    if by_vision and endpoint is not None:
+    if by_vision and options.endpoint is not None:
         raise CommandError("usage", "--by-vision reads the cell's model: run it on the cell's host, without --endpoint")
-    arm = learnt_arm(cell, operator) if by_vision else None
-    with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
+    arm = learnt_arm(cell, options.operator) if by_vision else None
+    with options.client(cell, interruption.check) as client:
         if arm is not None:
-            _by_vision(client, arm, check, speed_scale, json)
+            _by_vision(client, arm, check, speed_scale, options.json)
             return
         with client.home(speed_scale) as handle:
-            follow(handle, json, client.cell)
+            follow(handle, options.json, client.cell)
 
 
 def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, as_json: bool) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, emit
+from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, SetPointsOption, emit
 from stereoservo.cli.target_options import make_goal, target_tree
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError
@@ -48,10 +48,7 @@ class LearntArm:
 def ik(
     cell: CellArgument,
     name: Annotated[str, typer.Argument(metavar="[GOAL]", help="Name of a taught goal.")] = "",
-    set_points: Annotated[
-        Path | None,
-        typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
-    ] = None,
+    set_points: SetPointsOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:

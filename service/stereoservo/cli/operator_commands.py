@@ -1,5 +1,5 @@
-"""Commands of the operator that set the state of a cell: ``stereoservo enable``, ``disable``, ``hold``, ``resume``,
-``reset`` (after a fault), ``acknowledge`` (a goal that is reached) and ``cancel``.
+"""Commands of the operator that take effect at once: the cell's state (``stereoservo enable``, ``disable``, ``hold``,
+``resume``, ``reset``, ``acknowledge``, ``cancel``), and motions at hand (``jog``, ``auxiliary``).
 """
 
 from __future__ import annotations
@@ -10,92 +10,57 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import (
-    CellArgument,
-    CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
-    emit,
-    pairs,
-)
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, pairs
 from stereoservo.client import Client, ClientError
 from stereoservo.messages.wire import StateMessage
 
 
-def enable(
-    cell: CellArgument,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+def enable(cell: CellArgument, options: CellOptions = CELL_OPTIONS) -> None:
     """Let the arm move: power on, brakes released, at rest."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         client.enable()
         state = client.status()
-    emit(state, state.lifecycle, json)
+    options.emit(state, state.lifecycle)
 
 
-def disable(
-    cell: CellArgument,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+def disable(cell: CellArgument, options: CellOptions = CELL_OPTIONS) -> None:
     """Stop the arm and switch its drives off."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         reply = client.disable()
-    emit(reply, reply.message, json)
+    options.emit(reply, reply.message)
 
 
-def hold(
-    cell: CellArgument,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+def hold(cell: CellArgument, options: CellOptions = CELL_OPTIONS) -> None:
     """Decelerate and hold; the goal is kept for `resume`."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         reply = client.hold()
-    emit(reply, reply.message, json)
+    options.emit(reply, reply.message)
 
 
-def resume(
-    cell: CellArgument,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+def resume(cell: CellArgument, options: CellOptions = CELL_OPTIONS) -> None:
     """Go on after `hold` or `stop`, from the measured state."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         reply = client.resume()
-    emit(reply, reply.message, json)
+    options.emit(reply, reply.message)
 
 
-def reset(
-    cell: CellArgument,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+def reset(cell: CellArgument, options: CellOptions = CELL_OPTIONS) -> None:
     """Leave a fault whose cause is gone; the arm stays off until `enable`."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         client.reset()
         state = client.status()
-    emit(state, f"{state.lifecycle}: the fault is cleared; `stereoservo enable {cell}` switches on", json)
+    options.emit(state, f"{state.lifecycle}: the fault is cleared; `stereoservo enable {cell}` switches on")
 
 
 def acknowledge(
     cell: CellArgument,
     goal_id: Annotated[str, typer.Argument(metavar="ID", help="The goal that was reached.")],
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """A reached goal that waits may be left (a gripper has closed): the queue goes on."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         reply = client.acknowledge(goal_id)
-    emit(reply, reply.message, json)
+    options.emit(reply, reply.message)
 
 
 def cancel(
@@ -103,20 +68,18 @@ def cancel(
     goal_id: Annotated[
         str, typer.Argument(metavar="[ID]", help="The goal, active or queued (default: the active one).")
     ] = "",
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Cancel a goal, whoever sent it: the arm brakes, and the next one of the queue begins."""
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         goal_id = goal_id or client.status().goal
         if not goal_id:
             raise CommandError("no_goal", f"no goal is active in cell {client.cell!r}: there is nothing to cancel")
         reply = client.cancel(goal_id)
-    emit(reply, f"goal {goal_id}: {reply.message}", json)
+    options.emit(reply, f"goal {goal_id}: {reply.message}")
 
 
-# -- jog -------------------------------------------------------------------------------------------------------
+# -- jog: renews its lease while this process lives (a dead man's switch) -----------------------------------------
 
 
 LEASE_S = 0.3
@@ -127,13 +90,11 @@ def jog(
     cell: CellArgument,
     velocities: Annotated[list[str], typer.Argument(metavar="JOINT=VELOCITY...", help="[rad/s] or [m/s] by joint.")],
     seconds: Annotated[float, typer.Option(help="For how long; Ctrl-C ends it sooner.", min=0.0)] = 1.0,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Move joints at given velocities for some time."""
     requested = pairs(velocities, "velocity")
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         client.jog(requested, LEASE_S)
         try:
             until = time.monotonic() + seconds
@@ -144,10 +105,10 @@ def jog(
             with suppress(ClientError):  # the lease ends it anyway, slightly later
                 client.jog(dict.fromkeys(requested, 0.0), 0.05)
         state = client.wait_state(lambda s: s.source != "jog", "at rest", 3.0)
-    emit(state, "  ".join(f"{name} {value:+.4f}" for name, value in state.joints.items()), json)
+    options.emit(state, "  ".join(f"{name} {value:+.4f}" for name, value in state.joints.items()))
 
 
-# -- auxiliary -------------------------------------------------------------------------------------------------
+# -- joints and outputs beside the arm's --------------------------------------------------------------------------
 
 
 SWITCHED = {"on": "1", "off": "0"}
@@ -167,18 +128,16 @@ def auxiliary(
         float,
         typer.Option(help="Seconds to wait until they are there, or stand (a closed gripper).", min=0.0),
     ] = 5.0,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Move a gripper, switch an output: joints and outputs beside the arm's."""
     words = [item.partition("=") for item in values]
     ordered = pairs([f"{name}{equals}{SWITCHED.get(value, value)}" for name, equals, value in words], "value")
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         near = {spec.name: SHARE * (spec.high - spec.low) for spec in client.info().auxiliary}
         client.auxiliary(ordered)
         state = _arrived(client, ordered, near, wait)
-    emit(state, "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()), json)
+    options.emit(state, "  ".join(f"{name} {value:g}" for name, value in state.auxiliary.items()))
 
 
 def _arrived(client: Client, ordered: dict[str, float], near: dict[str, float], wait_s: float) -> StateMessage:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import msgspec
 import typer
+
+if TYPE_CHECKING:
+    from stereoservo.client import Client
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -42,19 +47,41 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON
 CellArgument = Annotated[
     str,
     typer.Argument(
-        metavar="CELL",
-        help="Name of a live cell, or path of a cell file (*.toml).",
-        autocompletion=cells_beginning,
+        metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).", autocompletion=cells_beginning
     ),
 ]
 EndpointOption = Annotated[
-    str | None,
-    typer.Option("--endpoint", help="zenoh endpoint of a daemon on another host (CELL is then its name)."),
+    str | None, typer.Option("--endpoint", help="zenoh endpoint of a daemon on another host (CELL is then its name).")
 ]
 OperatorOption = Annotated[
-    str | None,
-    typer.Option("--operator", help="Name under which commands are given (default: user and process)."),
+    str | None, typer.Option("--operator", help="Name under which commands are given (default: user and process).")
 ]
+SetPointsOption = Annotated[
+    Path | None,
+    typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
+]
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """Options of a command to a live cell; `dispatch` makes each field of a dataclass an option of the command line."""
+
+    endpoint: EndpointOption = None
+    operator: OperatorOption = None
+    json: JsonOption = False
+
+    def client(self, cell: str, while_waiting: Callable[[], None] = lambda: None) -> Client:
+        """Client of the cell, with these options."""
+        from stereoservo.client import Client
+
+        return Client(cell, endpoint=self.endpoint, operator=self.operator, while_waiting=while_waiting)
+
+    def emit(self, result: Any, text: str) -> None:
+        """Print a result: as JSON with ``--json``, else the text."""
+        emit(result, text, self.json)
+
+
+CELL_OPTIONS = CellOptions()
 
 
 class CommandError(Exception):

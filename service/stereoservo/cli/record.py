@@ -12,15 +12,13 @@ import msgspec
 import typer
 
 from stereoservo.cli.output import (
+    CELL_OPTIONS,
     CellArgument,
+    CellOptions,
     CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
-    emit,
     note,
 )
-from stereoservo.client import Client, EventWatch, HeardEvents
+from stereoservo.client import EventWatch, HeardEvents
 from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.wire import EventMessage
 
@@ -35,9 +33,7 @@ def record(
         bool,
         typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it."),
     ] = False,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Record the flight of a live cell into a file on its host; `replay` runs it again."""
 
@@ -46,7 +42,7 @@ def record(
             note(event.message)
 
     recorded: ImagesRecorded | None = None
-    with Client(cell, endpoint=endpoint, operator=operator) as client, EventWatch(client) as watch:
+    with options.client(cell) as client, EventWatch(client) as watch:
         heard = HeardEvents(watch, lambda event: True, hear)
         client.record(images=images)
         file = client.info().recording
@@ -78,4 +74,4 @@ def record(
             + ("" if one.why == "ended" else f", {one.why}")
             for one in recorded.cameras
         ]
-    emit(result, "\n".join(lines), json)
+    options.emit(result, "\n".join(lines))

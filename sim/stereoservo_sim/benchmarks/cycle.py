@@ -286,6 +286,7 @@ def _settings(cell: SyntheticCell) -> CoreSettings:
 
 
 GAIN, DAMPING = 1.0, 1e-6
+"""Gain [1/s] and damping, relative to the largest diagonal of the normal matrix."""
 WARM_UP = 100
 """Steps of the core that are not timed."""
 LARGE_BODIES = ((8, 2, 6), (64, 2, 6), (256, 2, 6), (256, 8, 6), (256, 8, 12))
@@ -595,10 +596,6 @@ def power(sizes: Sequence[float], costs: Sequence[float]) -> float:
 
 
 # -- stereo reference ------------------------------------------------------------------------------------------
-
-
-DAMPING = 1e-6
-"""Default damping, relative to the largest diagonal of the normal matrix."""
 
 
 class StereoStep(NamedTuple):

@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import msgspec
@@ -25,6 +25,7 @@ from stereoservo.calibration.camera_rig.rig_calibration import (
 )
 from stereoservo.calibration.camera_rig.views import RigViews, still_places
 from stereoservo.calibration.trial_data import TrialCamera
+from stereoservo.cli.calibrate.command import CalibrateOptions
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
 from stereoservo.cli.output import CommandError, note, shipped_or_path
 from stereoservo.daemon.camera_setup import recorded_camera, video_of
@@ -43,19 +44,6 @@ DEFAULT_OUTPUT = Path("rig.json")
 SHOWN_VIEWS, SHOWN_ADVICE = 3, 3
 
 
-class RigOptions(NamedTuple):
-    """Options of ``calibrate --rig`` as they were given."""
-
-    cell: str
-    images: Path | None
-    board: str
-    pitch: float | None
-    layout: Path | None
-    length: str
-    seconds: float
-    output: Path | None
-
-
 class RigReport(msgspec.Struct, frozen=True):
     """JSON of ``calibrate --rig``: the calibration's fields, the file, and pictures that would improve it."""
 
@@ -72,7 +60,7 @@ class RigReport(msgspec.Struct, frozen=True):
     file: str
 
 
-def calibrate_cameras(options: RigOptions) -> tuple[RigReport, str]:
+def calibrate_cameras(options: CalibrateOptions) -> tuple[RigReport, str]:
     """The report of a calibration, as tree and as text; the file is written.
 
     Raises CommandError, CalibrationError, and what cameras, recordings and cell files raise.
@@ -110,7 +98,7 @@ def _board(text: str, pitch: float | None) -> tuple[int, int] | None:
     return int(columns), int(rows)
 
 
-def _layout(options: RigOptions, board: tuple[int, int] | None, ids: tuple[int, ...]) -> FloatArray | None:
+def _layout(options: CalibrateOptions, board: tuple[int, int] | None, ids: tuple[int, ...]) -> FloatArray | None:
     """Positions (m, 3) [m] of the markers ``ids`` on the body, if they are stated."""
     if board is not None:
         assert options.pitch is not None
@@ -146,7 +134,7 @@ def _known(text: str, layout: FloatArray | None) -> KnownDistance | None:
         raise CommandError("length", f"--length {text!r}: ID,ID=METRES is valid, 3,7=0.12") from error
 
 
-def _views(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
+def _views(options: CalibrateOptions, board: tuple[int, int] | None) -> RigViews:
     if options.images is None:
         return _live(options)
     if options.images.suffix == IMAGES_SUFFIX:
@@ -154,7 +142,7 @@ def _views(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
     return _folders(options, board)
 
 
-def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
+def _folders(options: CalibrateOptions, board: tuple[int, int] | None) -> RigViews:
     """Views of pictures in one folder per camera; pictures of one pose have the same name, apart from the camera's."""
     assert options.images is not None
     folders = sorted(path for path in options.images.glob("*") if path.is_dir())
@@ -217,7 +205,7 @@ def _stacked(cameras: list[TrialCamera], keys: list[str], seen: dict[str, dict[s
     return RigViews(tuple(cameras), ids, tuple(keys), pixels, sigmas)
 
 
-def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -> Detector:
+def _detector(options: CalibrateOptions, camera: str, board: tuple[int, int] | None) -> Detector:
     """The board's detector, or that of the cell file's camera of this name."""
     context = DriverContext(MonotonicClock(), "rig", Path(), Path(), camera=camera)
     if board is not None:
@@ -242,7 +230,7 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
     return found
 
 
-def _recorded(options: RigOptions) -> RigViews:
+def _recorded(options: CalibrateOptions) -> RigViews:
     """Views of a recording of ``record --images``, taken while the body was held still."""
     assert options.images is not None
     if not options.cell:
@@ -259,7 +247,7 @@ def _recorded(options: RigOptions) -> RigViews:
     return still_places(cameras, seen)
 
 
-def _live(options: RigOptions) -> RigViews:
+def _live(options: CalibrateOptions) -> RigViews:
     """Views of a cell file's cameras, observed for some seconds while the body is held in various poses."""
     if not options.cell:
         raise CommandError(
