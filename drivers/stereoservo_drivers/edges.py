@@ -19,14 +19,7 @@ from msgspec import Meta
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import Fields, kernel, plain
-from stereoservo.ports.devices import (
-    CameraObservation,
-    DetectorDescription,
-    DriverContext,
-    DriverError,
-    Frame,
-    Prior,
-)
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.detectors.kernel_types import FLOAT, compile_for, fields, given, written
 from stereoservo_drivers.frame_images import sized_image
 from stereoservo_drivers.options import decode_options, invalid
@@ -275,12 +268,7 @@ def fit_line(places: Fields, sign: float, half: float, reach: float, found: Floa
 def compile_kernels() -> None:
     """Compile the kernels of the measurement, or load them from the cache."""
     compile_for(
-        fit_line,
-        fields(given(FLOAT, 1), given(FLOAT, 2), given(FLOAT, 2)),
-        FLOAT,
-        FLOAT,
-        FLOAT,
-        written(FLOAT, 1),
+        fit_line, fields(given(FLOAT, 1), given(FLOAT, 2), given(FLOAT, 2)), FLOAT, FLOAT, FLOAT, written(FLOAT, 1)
     )
 
 
@@ -612,10 +600,7 @@ class PartPose:
         """The pose after a step (7,), with the parameters of `slopes`."""
         turn = np.asarray(cv2.Rodrigues(step[:3].reshape(3, 1))[0], dtype=np.float64)
         return replace(
-            self,
-            R=turn @ self.R,
-            t=self.t + step[3:6],
-            focal=self.focal * float(np.exp(np.clip(step[6], -1, 1))),
+            self, R=turn @ self.R, t=self.t + step[3:6], focal=self.focal * float(np.exp(np.clip(step[6], -1, 1)))
         )
 
 

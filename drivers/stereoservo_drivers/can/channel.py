@@ -241,8 +241,7 @@ class Channel:
             return self._error("send_refused", f"{error}{self._status_text()}")
         if isinstance(error, SlcanGarbledError):
             return self._error(
-                "connection_lost",
-                f"{error}. Check the serial speed (`@…` in the channel) and the adapter's firmware",
+                "connection_lost", f"{error}. Check the serial speed (`@…` in the channel) and the adapter's firmware"
             )
         number = _errno(error)
         if isinstance(error, can.CanTimeoutError) or number in _FULL or "buffer full" in str(error).lower():

@@ -511,9 +511,7 @@ class DigitalOutputs:
         if found is None:
             names = ", ".join(output.name for output in used)
             raise DriverError(
-                "outputs",
-                f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}",
-                node_id=drive.node_id,
+                "outputs", f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}", node_id=drive.node_id
             )
         mask = drive.read_if_there(*OUTPUT_MASK)
         if mask is not None:

@@ -259,10 +259,7 @@ def parse_object(name: str, joint: str) -> tuple[int, int]:
 
 def identifier_writes(node_id: int) -> list[Write]:
     """Writes of the COB-IDs of SYNC (not produced by the drive: bit 30) and EMCY, for drives with other values."""
-    return [
-        Write(0x1005, 0, SYNC_ID, 0x400007FF),
-        Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF),
-    ]
+    return [Write(0x1005, 0, SYNC_ID, 0x400007FF), Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF)]
 
 
 def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list[Write]:
@@ -278,11 +275,7 @@ def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list
         Write(0x1017, 0, 0 if guarded else options.heartbeat_ms, option="heartbeat_ms"),
         Write(*ABORT_OPTION, options.abort_option, option="abort_option"),
         Write(*QUICK_STOP_OPTION, options.quick_stop_option, option="quick_stop_option"),
-        Write(
-            *QUICK_STOP_RAMP,
-            scale.rate_units(joint.quick_stop_deceleration),
-            option="quick_stop_deceleration",
-        ),
+        Write(*QUICK_STOP_RAMP, scale.rate_units(joint.quick_stop_deceleration), option="quick_stop_deceleration"),
         Write(*FAULT_REACTION, FAULT_REACTION_QUICK_STOP),
         *(Write(*key, limit, option="max_velocity") for key in SPEEDS),
         *(Write(*key, acceleration, option="max_acceleration") for key in RAMPS),
@@ -332,12 +325,7 @@ def unwatch_writes(setup: Setup) -> list[Write]:
 
 
 def one_pdo_writes(
-    number: int,
-    base: tuple[int, int],
-    cob_id: int,
-    mapping: tuple[int, ...],
-    transmission: int,
-    deadline_ms: int,
+    number: int, base: tuple[int, int], cob_id: int, mapping: tuple[int, ...], transmission: int, deadline_ms: int
 ) -> list[Write]:
     """Writes of one PDO in the order of CiA 301: off, no mapping, mapping, type, deadline, on."""
     communication, mapped = base[0] + number, base[1] + number
@@ -397,15 +385,7 @@ def load_eds(path: Path) -> canopen.ObjectDictionary:
 
     try:
         dictionary = import_od(str(path))
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        NotImplementedError,
-        OSError,
-        configparser.Error,
-    ) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, NotImplementedError, OSError, configparser.Error) as error:
         raise DriverError("eds", f"{path} is not an EDS file of CiA 306: {error}", path=str(path)) from error
     if not len(dictionary):
         raise DriverError("eds", f"{path} holds no objects", path=str(path))

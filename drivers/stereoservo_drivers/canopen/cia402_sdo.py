@@ -20,12 +20,7 @@ from canopen.sdo.client import ReadableStream, WritableStream
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.cia402 import DriveAxis
-from stereoservo_drivers.canopen.cia402_words import (
-    ABORT_NO_OBJECT,
-    ABORT_NO_SUBINDEX,
-    abort_hint,
-    abort_words,
-)
+from stereoservo_drivers.canopen.cia402_words import ABORT_NO_OBJECT, ABORT_NO_SUBINDEX, abort_hint, abort_words
 from stereoservo_drivers.canopen.codec import Link
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())

@@ -49,10 +49,7 @@ OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
 """Python's switch interval [s]: another thread of the process may compute this long before the bus thread continues."""
 _POLL_S = 0.001
-_LOADS: dict[Literal["efforts", "following_errors"], str] = {
-    "efforts": "effort",
-    "following_errors": "following_error",
-}
+_LOADS: dict[Literal["efforts", "following_errors"], str] = {"efforts": "effort", "following_errors": "following_error"}
 """Names required in ``feedback`` for a sample to contain the values."""
 
 
@@ -211,8 +208,7 @@ class CanJointDriver:
         if not self._wait(self._is_off, limit_s):
             states = ", ".join(self._codec.status_words())
             raise DriverError(
-                "not_off",
-                f"the drives are not off {limit_s:.1f} s after they were told to be; they say: {states}",
+                "not_off", f"the drives are not off {limit_s:.1f} s after they were told to be; they say: {states}"
             )
 
     def _is_off(self) -> bool:
@@ -295,8 +291,7 @@ class CanJointDriver:
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self.options.joint),):
             raise DriverError(
-                "shape",
-                f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)",
+                "shape", f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)"
             )
         if not np.isfinite(asked).all():
             raise DriverError("not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite")

@@ -194,10 +194,7 @@ def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding
         return ExaminationFinding("cycle", True, message)
     if skipped > MISSED_SHARE * cycles:
         return ExaminationFinding(
-            "cycle",
-            None,
-            message,
-            "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
+            "cycle", None, message, "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz"
         )
     remedy = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
     return ExaminationFinding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, remedy)

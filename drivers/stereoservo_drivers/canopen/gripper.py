@@ -16,14 +16,7 @@ import msgspec
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import (
-    EMCY_ID,
-    HEARTBEAT_ID,
-    RPDO_IDS,
-    STATUS_AND_POSITION,
-    TPDO_IDS,
-    DriveAxis,
-)
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, RPDO_IDS, STATUS_AND_POSITION, TPDO_IDS, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     AT_ONCE,
     CONTROL_WORD,
@@ -227,10 +220,7 @@ class Gripper:
         self._statuses.clear()
         if len(newest) != _WORD_AND_POSITION.size:
             return self._fault(
-                "mapping",
-                f"TPDO1 has {len(newest)} bytes, {_WORD_AND_POSITION.size} are mapped",
-                len(newest),
-                "reset",
+                "mapping", f"TPDO1 has {len(newest)} bytes, {_WORD_AND_POSITION.size} are mapped", len(newest), "reset"
             )
         word, counts = _WORD_AND_POSITION.unpack(newest)
         self.axis.take_status(word)
@@ -280,10 +270,7 @@ class Gripper:
         ):
             if now_ns - heard_ns > self._silent_ns:
                 return self._fault(
-                    code,
-                    f"no {what} for {self._silent_ns * 1e-6:.0f} ms",
-                    None,
-                    "check its supply and the bus cable",
+                    code, f"no {what} for {self._silent_ns * 1e-6:.0f} ms", None, "check its supply and the bus cable"
                 )
         waited_s = (now_ns - self._since_ns) * 1e-9
         if self._on and not self._was_enabled and waited_s > ENABLE_LIMIT_S:

@@ -713,10 +713,7 @@ class Master:
         states = zip(self.settings.joints, self.codec.status_words(), strict=True)
         words = ", ".join(f"{joint.name}: {state}" for joint, state in states)
         if value is None:
-            message, hint = (
-                f"a drive left its enabled state by itself: {words}",
-                "look at the drive's own inputs",
-            )
+            message, hint = (f"a drive left its enabled state by itself: {words}", "look at the drive's own inputs")
         else:
             message = f"not all drives are enabled after {value:.2f} s, limit {limit:g}: {words}"
             hint = "is the power stage supplied, is the emergency stop released?"

@@ -75,8 +75,7 @@ def found_buses(
         if port.vid is not None:
             found.append(
                 FoundBus(
-                    f"serial port {port.device} ({port.description})",
-                    {"interface": SLCAN, "channel": port.device},
+                    f"serial port {port.device} ({port.description})", {"interface": SLCAN, "channel": port.device}
                 )
             )
     return tuple(found)

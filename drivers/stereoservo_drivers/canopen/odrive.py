@@ -24,15 +24,7 @@ from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
 
-VERSION, HEARTBEAT, GET_ERROR, RX_SDO, TX_SDO, ADDRESS, SET_AXIS_STATE = (
-    0x00,
-    0x01,
-    0x03,
-    0x04,
-    0x05,
-    0x06,
-    0x07,
-)
+VERSION, HEARTBEAT, GET_ERROR, RX_SDO, TX_SDO, ADDRESS, SET_AXIS_STATE = (0x00, 0x01, 0x03, 0x04, 0x05, 0x06, 0x07)
 GET_ENCODER_ESTIMATES, SET_CONTROLLER_MODE, SET_INPUT_VEL = 0x09, 0x0B, 0x0D
 SET_LIMITS, CLEAR_ERRORS, GET_TORQUES = 0x0F, 0x18, 0x1C
 IDLE, CLOSED_LOOP_CONTROL = 1, 8

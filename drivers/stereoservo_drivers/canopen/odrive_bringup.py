@@ -308,9 +308,7 @@ class OdriveBringup:
                 for axis, said in zip(self.codec.axes, self.codec.status_words(), strict=True)
             )
             raise DriverError(
-                "not_idle",
-                f"after {HEARTBEAT_WAIT_S} s not all axes say that they are idle: {words}",
-                retry=True,
+                "not_idle", f"after {HEARTBEAT_WAIT_S} s not all axes say that they are idle: {words}", retry=True
             )
 
 

@@ -47,8 +47,7 @@ class LearnOptions:
     cell: Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell file: names of its cameras.")]
     out: Annotated[Path, typer.Argument(metavar="OUT.npz", help="File to write.")]
     images: Annotated[
-        Path | None,
-        typer.Option(help="Folder with CAMERA.png, CAMERA_*.png (averaged) or CAMERA.avi of each camera."),
+        Path | None, typer.Option(help="Folder with CAMERA.png, CAMERA_*.png (averaged) or CAMERA.avi of each camera.")
     ] = None
     pair: Annotated[
         tuple[Path, Path] | None,
@@ -62,8 +61,7 @@ class LearnOptions:
         Path | None, typer.Option(help="A folder as --images, after the last joint alone has moved.")
     ] = None
     ask_to_move: Annotated[
-        bool,
-        typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again."),
+        bool, typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again.")
     ] = False
     frames: Annotated[int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")] = 8
     most: Annotated[int, typer.Option(min=16, max=2000, help="Landmarks to keep.")] = 150
@@ -147,8 +145,7 @@ def _observations(
     running = daemon_info(cell_directories(cell.cell.name))
     if running is not None:
         raise LearnError(
-            "running",
-            f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images",
+            "running", f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images"
         )
     before = _take_frames(cell, path, frames)
     if not ask:
@@ -224,8 +221,7 @@ def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
         while short := [name for name, seen in views.items() if len(seen) < frames]:
             if time.monotonic() > until:
                 raise DriverError(
-                    "silent",
-                    f"camera {short[0]!r} gave {len(views[short[0]])} of {frames} frames in {PATIENCE_S:g} s",
+                    "silent", f"camera {short[0]!r} gave {len(views[short[0]])} of {frames} frames in {PATIENCE_S:g} s"
                 )
             for name in short:
                 _take(name, opened[name].poll(), views[name], frames)

@@ -142,8 +142,7 @@ class JointBench:
             driver = self.setup.make_driver(self.context)
         except Exception as error:  # whatever a third party's constructor raises
             raise CheckFailedError(
-                f"the driver cannot be made: {told(error)}",
-                "its options: `--options`, `--cell`, make_driver()",
+                f"the driver cannot be made: {told(error)}", "its options: `--options`, `--cell`, make_driver()"
             ) from error
         self._drivers.append(driver)
         return driver

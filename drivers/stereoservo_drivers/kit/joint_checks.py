@@ -49,21 +49,14 @@ GONE_S = 1.0
 def describes_itself(bench: JointBench) -> str:
     """Check that the description is available before anything connects, and plausible; reports suspicious limits."""
     driver = bench.new()
-    require(
-        isinstance(driver, JointDriver),
-        f"{type(driver).__name__} lacks methods of JointDriver",
-        "all its methods",
-    )
+    require(isinstance(driver, JointDriver), f"{type(driver).__name__} lacks methods of JointDriver", "all its methods")
     description = driver.describe()
     names = [joint.name for joint in description.joints]
     require(bool(names) and len(set(names)) == len(names), f"joints are called {names}")
     for joint in description.joints:
         require(joint.position_min < joint.position_max, f"{joint.name}: empty range of positions")
         require(joint.velocity_max > 0 and joint.acceleration_max > 0, f"{joint.name}: limits must be above 0")
-        require(
-            joint.resolution < joint.position_max - joint.position_min,
-            f"{joint.name}: resolution above its range",
-        )
+        require(joint.resolution < joint.position_max - joint.position_min, f"{joint.name}: resolution above its range")
     for name in ("rate_hz", "command_timeout_s", "call_budget_us"):
         require(getattr(description, name) > 0, f"{name} must be above 0")
     require(len(description.effort_units) in (0, len(names)), "effort_units: none, or one for each joint")
@@ -349,12 +342,7 @@ def _verdict(check: JointCheck, bench: JointBench, run: Callable[[JointBench], s
 
 
 JOINT_CHECKS = (
-    JointCheck(
-        "describes itself",
-        describes_itself,
-        "fill in JointDriverDescription before anything connects",
-        False,
-    ),
+    JointCheck("describes itself", describes_itself, "fill in JointDriverDescription before anything connects", False),
     JointCheck(
         "refuses calls before configure",
         refuses_before_configure,
@@ -369,11 +357,7 @@ JOINT_CHECKS = (
         "DriverLifecycle.require(); activate() again after deactivate()",
     ),
     JointCheck("refuses calls once closed", refuses_once_closed, "DriverLifecycle.require(); close() twice"),
-    JointCheck(
-        "leaves nothing behind",
-        leaves_nothing_behind,
-        "join threads, close ports and sockets in close()",
-    ),
+    JointCheck("leaves nothing behind", leaves_nothing_behind, "join threads, close ports and sockets in close()"),
     JointCheck(
         "numbers and stamps its samples",
         numbers_its_samples,
@@ -391,9 +375,7 @@ JOINT_CHECKS = (
         "are in, and whether its pose is base from tool",
     ),
     JointCheck(
-        "stops",
-        motion.stops,
-        "stop() commands velocity zero, in any state, and catches what the device raises",
+        "stops", motion.stops, "stop() commands velocity zero, in any state, and catches what the device raises"
     ),
     JointCheck(
         "stops when commands cease",
@@ -406,9 +388,7 @@ JOINT_CHECKS = (
         "close() begins with stop(), and leaves the device's time-out armed until the arm stands",
     ),
     JointCheck(
-        "refuses bad commands",
-        motion.refuses_bad_commands,
-        "check shape and np.isfinite before anything is sent",
+        "refuses bad commands", motion.refuses_bad_commands, "check shape and np.isfinite before anything is sent"
     ),
     JointCheck("cuts velocities at the limits", motion.cuts_velocities, "clip to velocity_max and say it in reasons"),
     JointCheck(
@@ -417,21 +397,9 @@ JOINT_CHECKS = (
         "units [rad/s, m/s] and sign of the velocities; of a Cartesian arm, whether its three angles are a rotation "
         "vector or turns in some order",
     ),
-    JointCheck(
-        "states its resolution",
-        states_its_resolution,
-        "JointSpec(resolution=encoder step at the joint)",
-    ),
-    JointCheck(
-        "keeps samples apart",
-        keeps_samples_apart,
-        "new arrays in every JointState and CommandReport",
-    ),
-    JointCheck(
-        "is silent once closed",
-        is_silent_once_closed,
-        "end threads in close(); stop() only while open",
-    ),
+    JointCheck("states its resolution", states_its_resolution, "JointSpec(resolution=encoder step at the joint)"),
+    JointCheck("keeps samples apart", keeps_samples_apart, "new arrays in every JointState and CommandReport"),
+    JointCheck("is silent once closed", is_silent_once_closed, "end threads in close(); stop() only while open"),
     JointCheck(
         "answers in time",
         motion.answers_in_time,

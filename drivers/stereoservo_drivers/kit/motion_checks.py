@@ -230,8 +230,7 @@ def stops_when_commands_cease(bench: JointBench) -> str:
     bench.drive(driver, velocity, 0.2)
     read = bench.settle(driver, timeout + bench.setup.brake_s)
     bench.require_rest(
-        driver,
-        f"{timeout:g} s (time-out) and {bench.setup.brake_s:g} s after the last command, while it is read,",
+        driver, f"{timeout:g} s (time-out) and {bench.setup.brake_s:g} s after the last command, while it is read,"
     )
     after_reads = _recovery(bench, driver, velocity, read.positions)
     driver.close()
@@ -411,8 +410,7 @@ def orders_auxiliary(bench: JointBench) -> str:
     for spec in specs:
         now, was = stopped[spec.name], before[spec.name]
         require(
-            (now - was) * (ends[spec.name] - was) > 0.0,
-            f"{spec.name} is at {now:g}, ordered to {ends[spec.name]:g}",
+            (now - was) * (ends[spec.name] - was) > 0.0, f"{spec.name} is at {now:g}, ordered to {ends[spec.name]:g}"
         )
         still = abs(after[spec.name] - now) <= 1e-3 * (spec.high - spec.low)
         require(still, f"{spec.name} moves on after stop(), from {now:g} to {after[spec.name]:g}")

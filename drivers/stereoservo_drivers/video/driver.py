@@ -14,14 +14,7 @@ from typing import Any, Protocol
 import cv2
 
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import (
-    CameraDescription,
-    CameraStatistics,
-    Clock,
-    DriverContext,
-    DriverError,
-    Frame,
-)
+from stereoservo.ports.devices import CameraDescription, CameraStatistics, Clock, DriverContext, DriverError, Frame
 from stereoservo.ports.discovery import FoundCamera
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
@@ -29,13 +22,7 @@ from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decod
 from stereoservo_drivers.video.pictures import check_size, one_channel
 from stereoservo_drivers.video.playback import Playback
 from stereoservo_drivers.video.server_clock import ServerClock
-from stereoservo_drivers.video.sources import (
-    CaptureSource,
-    GenicamSource,
-    LiveSource,
-    Settings,
-    SourcePicture,
-)
+from stereoservo_drivers.video.sources import CaptureSource, GenicamSource, LiveSource, Settings, SourcePicture
 from stereoservo_drivers.video.stream_monitor import Watch
 
 LIVE_BUDGET_US = 1000.0

@@ -312,10 +312,7 @@ class NumberedPictures:
             raise place.error("start", f"start = {options.start}; there are the numbers {numbers[0]} to {numbers[-1]}")
         self._next = options.start or numbers[0]
         self._last = numbers[-1]
-        gap = next(
-            (a + 1 for a, b in pairwise(numbers) if b != a + 1 and a >= self._next),
-            None,
-        )
+        gap = next((a + 1 for a, b in pairwise(numbers) if b != a + 1 and a >= self._next), None)
         if gap is not None:
             raise place.error(
                 "sequence_gap",
@@ -342,18 +339,14 @@ class NumberedPictures:
         size = path.stat().st_size
         if size > LARGEST_PICTURE:
             raise self._place.error(
-                "frame_too_large",
-                f"{path.name} has {size} bytes; at most {LARGEST_PICTURE} are read",
-                frame=number,
+                "frame_too_large", f"{path.name} has {size} bytes; at most {LARGEST_PICTURE} are read", frame=number
             )
         data = path.read_bytes()
         if path.suffix.lower() not in (".jpg", ".jpeg") or jpeg_size(data) is not None:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), PICTURE_FLAG)
         if image is None:
             raise self._place.error(
-                "corrupt",
-                f"{path.name} is no whole picture: cut off, damaged, or of another kind",
-                frame=number,
+                "corrupt", f"{path.name} is no whole picture: cut off, damaged, or of another kind", frame=number
             )
         return image
 

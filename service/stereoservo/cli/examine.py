@@ -40,13 +40,11 @@ def examine(
     dataset: Annotated[
         Path,
         typer.Argument(
-            metavar="DATASET",
-            help="A flight recording (*.mcap), a folder or a LeRobot data set: docs/recordings.md.",
+            metavar="DATASET", help="A flight recording (*.mcap), a folder or a LeRobot data set: docs/recordings.md."
         ),
     ],
     units: Annotated[
-        str | None,
-        typer.Option(help="Of a LeRobot data set: in what its states are, such as deg,gripper.pos=none."),
+        str | None, typer.Option(help="Of a LeRobot data set: in what its states are, such as deg,gripper.pos=none.")
     ] = None,
     cameras: Annotated[
         str | None, typer.Option(help="Of a LeRobot data set: the cameras to examine, such as top,side.")
@@ -292,13 +290,7 @@ def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
 # docs/recordings.md has the format.
 
 
-JOINTS, POSES, MARKERS, FRAMES, CAMERAS = (
-    "joints.csv",
-    "poses.csv",
-    "markers.csv",
-    "frames.csv",
-    "cameras.csv",
-)
+JOINTS, POSES, MARKERS, FRAMES, CAMERAS = ("joints.csv", "poses.csv", "markers.csv", "frames.csv", "cameras.csv")
 DETECTOR = "detector.toml"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
@@ -440,11 +432,7 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
         sigma = _number(path, line, row, "sigma") if row.get("sigma") else STATED_PX
         if not sigma > 0.0:
             raise _wrong(path, line, "sigma", row["sigma"], "a positive number [px]")
-        seen[_whole(path, line, row, "marker")] = (
-            _number(path, line, row, "u"),
-            _number(path, line, row, "v"),
-            sigma,
-        )
+        seen[_whole(path, line, row, "marker")] = (_number(path, line, row, "u"), _number(path, line, row, "v"), sigma)
     return frames
 
 
@@ -532,8 +520,7 @@ def _time_column(path: Path, rows: Rows) -> str:
     found = [name for name in (TIME, ORDER) if name in rows[0]]
     if len(found) != 1:
         raise CommandError(
-            "dataset",
-            f"{path} needs one of the columns {TIME!r} [s] and {ORDER!r}; it has {found or 'neither'}",
+            "dataset", f"{path} needs one of the columns {TIME!r} [s] and {ORDER!r}; it has {found or 'neither'}"
         )
     return found[0]
 

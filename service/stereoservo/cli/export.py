@@ -64,8 +64,7 @@ def export(
         ),
     ],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Of a recording: file to write (default: FILE.foxglove.mcap)."),
+        Path | None, typer.Option("--output", "-o", help="Of a recording: file to write (default: FILE.foxglove.mcap).")
     ] = None,
     urdf: Annotated[
         Path | None, typer.Option("--urdf", metavar="FILE", help="Of a metric model: the URDF file to write.")
@@ -86,18 +85,14 @@ def export(
     cell: Annotated[
         Path | None,
         typer.Option(
-            "--cell",
-            metavar="FILE",
-            help="Cell file: calibration.known_length, and safety.limit for the URDF.",
+            "--cell", metavar="FILE", help="Cell file: calibration.known_length, and safety.limit for the URDF."
         ),
     ] = None,
     opencv: Annotated[
-        Path | None,
-        typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write."),
+        Path | None, typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write.")
     ] = None,
     ros: Annotated[
-        Path | None,
-        typer.Option("--ros", metavar="DIR", help="Of cameras: folder for a camera_info YAML of each."),
+        Path | None, typer.Option("--ros", metavar="DIR", help="Of cameras: folder for a camera_info YAML of each.")
     ] = None,
     kalibr: Annotated[
         Path | None, typer.Option("--kalibr", metavar="FILE.yaml", help="Of cameras: Kalibr's camera chain.")
@@ -148,11 +143,7 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
         exchange.save_kalibr(cameras, kalibr)
         written.append(str(kalibr))
     names = [camera.name for camera in cameras]
-    emit(
-        {"written": written, "cameras": names, "unit": unit},
-        f"{', '.join(names)}: {', '.join(written)}",
-        json,
-    )
+    emit({"written": written, "cameras": names, "unit": unit}, f"{', '.join(names)}: {', '.join(written)}", json)
 
 
 def _export_flight(file: Path, target: Path, json: bool) -> None:
@@ -309,12 +300,7 @@ class FlightChannels:
     def _state(self, t_ns: int, status: Status) -> Iterator[Published]:
         names = self.settings.joint_names
         yield joints(
-            "/joints",
-            t_ns,
-            names,
-            positions=status.positions,
-            velocities=status.velocities,
-            efforts=status.efforts,
+            "/joints", t_ns, names, positions=status.positions, velocities=status.velocities, efforts=status.efforts
         )
         yield joints("/command", t_ns, names, velocities=status.command)
         yield Published("/status", t_ns, cell_status(status))

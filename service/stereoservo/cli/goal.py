@@ -110,8 +110,7 @@ class GoalOptions:
         str, typer.Argument(metavar="[NAME]", help="Name of a taught goal.", autocompletion=goals_beginning)
     ] = ""
     relative_to: Annotated[
-        str | None,
-        typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have)."),
+        str | None, typer.Option(help="Of a taught goal: workpiece (which may have moved) or cameras (which have).")
     ] = None
     common: Annotated[
         str | None,
@@ -126,8 +125,7 @@ class GoalOptions:
         typer.Option(metavar="A-B-C,...", help="Faces, each by ids of points on it; others then than now will do."),
     ] = None
     joint: Annotated[
-        list[str] | None,
-        typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable."),
+        list[str] | None, typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable.")
     ] = None
     set_points: Annotated[
         Path | None,
@@ -136,9 +134,7 @@ class GoalOptions:
     images: Annotated[
         Path | None,
         typer.Option(
-            "--images",
-            metavar="DIR",
-            help="Set-points out of pictures recorded by `record --images`, at rest.",
+            "--images", metavar="DIR", help="Set-points out of pictures recorded by `record --images`, at rest."
         ),
     ] = None
     at: Annotated[float, typer.Option("--at", help="With --images: seconds from their beginning.", min=0.0)] = 0.0
@@ -152,14 +148,11 @@ class GoalOptions:
     displacement: Annotated[
         Path | None,
         typer.Option(
-            "--displacement",
-            metavar="FILE",
-            help='JSON: {"matrix": 4x4, "model_epoch": N or "basis": 5 ids}.',
+            "--displacement", metavar="FILE", help='JSON: {"matrix": 4x4, "model_epoch": N or "basis": 5 ids}.'
         ),
     ] = None
     incidence: Annotated[
-        Path | None,
-        typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.'),
+        Path | None, typer.Option("--incidence", metavar="FILE", help='JSON: {"incidences": […], "secondary": …}.')
     ] = None
     follow_file: Annotated[
         str | None,
@@ -193,8 +186,7 @@ class GoalOptions:
         list[str] | None, typer.Option("--camera", help="Camera that may be used; repeatable (default: all).")
     ] = None
     profile: Annotated[
-        str | None,
-        typer.Option(help="linear, exponential, translation-first, …, for laws that follow a plan."),
+        str | None, typer.Option(help="linear, exponential, translation-first, …, for laws that follow a plan.")
     ] = None
     posture: Annotated[
         int | None,
@@ -224,12 +216,10 @@ class GoalOptions:
     time_limit: Annotated[float | None, typer.Option(help="Abort after so long [s].")] = None
     queue: Annotated[bool, typer.Option("--queue", help="After the active goal, not instead of it.")] = False
     blend: Annotated[
-        float | None,
-        typer.Option(metavar="PX", help="Go on to the next goal below this error, without a stop."),
+        float | None, typer.Option(metavar="PX", help="Go on to the next goal below this error, without a stop.")
     ] = None
     acknowledge: Annotated[
-        float | None,
-        typer.Option(metavar="SECONDS", help="Reached, wait so long for `acknowledge` before going on."),
+        float | None, typer.Option(metavar="SECONDS", help="Reached, wait so long for `acknowledge` before going on.")
     ] = None
     check: Annotated[bool, typer.Option("--check", help="Only say what it would do; nothing moves.")] = False
     wait: Annotated[bool, typer.Option("--wait/--no-wait", help="Wait for its end.")] = True
@@ -326,13 +316,7 @@ def _followed(source: str) -> tuple[dict[str, Any], Stream]:
     return target, chain([first], stream)
 
 
-def _run(
-    client: Client,
-    requested: Goal,
-    stream: Stream | None,
-    wait: bool,
-    as_json: bool,
-) -> None:
+def _run(client: Client, requested: Goal, stream: Stream | None, wait: bool, as_json: bool) -> None:
     if wait and requested.lease_s is None:
         requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     try:

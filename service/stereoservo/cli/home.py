@@ -12,15 +12,7 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.goal import follow
 from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
-from stereoservo.cli.output import (
-    CELL_OPTIONS,
-    CellArgument,
-    CellOptions,
-    CommandError,
-    emit,
-    note,
-    note_hold,
-)
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, emit, note, note_hold
 from stereoservo.client import Client
 from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.wire import FeaturesMessage
@@ -56,8 +48,7 @@ class Look(NamedTuple):
 def home(
     cell: CellArgument,
     by_vision: Annotated[
-        bool,
-        typer.Option("--by-vision", help="By the pictures of the home posture; tells by what each zero is off."),
+        bool, typer.Option("--by-vision", help="By the pictures of the home posture; tells by what each zero is off.")
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="With --by-vision: only tell the zeros; nothing moves.")
@@ -315,11 +306,7 @@ def _told(arm: LearntArm, rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _undecided(
-    arm: LearntArm,
-    rows: list[dict[str, Any]],
-    postures: list[list[float]],
-    telling: TellingMotion | None,
-    right: bool,
+    arm: LearntArm, rows: list[dict[str, Any]], postures: list[list[float]], telling: TellingMotion | None, right: bool
 ) -> list[str]:
     """Lines on an observation that several postures explain."""
     lines = [

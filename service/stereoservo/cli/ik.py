@@ -141,8 +141,7 @@ def _images(arm: LearntArm, target: dict[str, Any]) -> tuple[FloatArray, FloatAr
         goals = load_taught(cell_directories(arm.cell.cell.name).taught)
         if target["name"] not in goals:
             raise CommandError(
-                "unknown_goal",
-                f"no taught goal {target['name']!r}; taught: {', '.join(sorted(goals)) or 'none'}",
+                "unknown_goal", f"no taught goal {target['name']!r}; taught: {', '.join(sorted(goals)) or 'none'}"
             )
         goal = goals[target["name"]]
         seen, stated = goal.target.set_points, goal.sigmas

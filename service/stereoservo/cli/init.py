@@ -75,8 +75,7 @@ def init(
             "`stereoservo setup` find the drives",
         ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
-        {},
-        DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]),
+        {}, DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0])
     ).describe()
     detector_name = detector if described.delivers == "frames" else ""
     sections = [CameraSection(name, camera_driver, detector_name) for name in cameras]

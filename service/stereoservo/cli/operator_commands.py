@@ -125,8 +125,7 @@ def auxiliary(
         list[str], typer.Argument(metavar="NAME=VALUE...", help="[rad] or [m] by joint; on or off by output.")
     ],
     wait: Annotated[
-        float,
-        typer.Option(help="Seconds to wait until they are there, or stand (a closed gripper).", min=0.0),
+        float, typer.Option(help="Seconds to wait until they are there, or stand (a closed gripper).", min=0.0)
     ] = 5.0,
     options: CellOptions = CELL_OPTIONS,
 ) -> None:

@@ -57,8 +57,7 @@ OperatorOption = Annotated[
     str | None, typer.Option("--operator", help="Name under which commands are given (default: user and process).")
 ]
 SetPointsOption = Annotated[
-    Path | None,
-    typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
+    Path | None, typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.')
 ]
 
 

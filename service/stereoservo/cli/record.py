@@ -11,13 +11,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import (
-    CELL_OPTIONS,
-    CellArgument,
-    CellOptions,
-    CommandError,
-    note,
-)
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, note
 from stereoservo.client import EventWatch, HeardEvents
 from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.wire import EventMessage
@@ -30,8 +24,7 @@ def record(
     cell: CellArgument,
     seconds: Annotated[float, typer.Option(help="For how long (default: until Ctrl-C).", min=0.0)] = math.inf,
     images: Annotated[
-        bool,
-        typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it."),
+        bool, typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it.")
     ] = False,
     options: CellOptions = CELL_OPTIONS,
 ) -> None:

@@ -10,14 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import (
-    CELL_OPTIONS,
-    CellArgument,
-    CellOptions,
-    CommandError,
-    marker_ids,
-    read_file,
-)
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, marker_ids, read_file
 from stereoservo.messages.decoding import decoding
 from stereoservo.messages.wire import Synthesise, decode, encode
 

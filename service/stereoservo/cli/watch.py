@@ -76,9 +76,7 @@ def _viewers(
     """The requested viewers; ``opened`` closes them."""
     found: list[FoxgloveServer | RerunViewer] = []
     if port is not None:
-        from stereoservo.cli.foxglove_server import (
-            FoxgloveServer,
-        )  # of the extra `cell`: only for this
+        from stereoservo.cli.foxglove_server import FoxgloveServer  # of the extra `cell`: only for this
 
         server = opened.enter_context(FoxgloveServer(cell, port))
         note(f"in Foxglove: Open connection, ws://localhost:{server.port}")

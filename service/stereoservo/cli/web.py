@@ -28,24 +28,20 @@ THREADS_S = 1.0
 
 def web(
     cell: Annotated[
-        str | None,
-        typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml)."),
+        str | None, typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).")
     ] = None,
     flight: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell."),
+        Path | None, typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell.")
     ] = None,
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
     address: Annotated[str, typer.Option(help="Address to listen on; any but loopback needs --tls.")] = "127.0.0.1",
     tls: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
+        Path | None, typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address.")
     ] = None,
     host: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME",
-            help="Another name under which browsers reach the server (a cell.example); repeat.",
+            metavar="NAME", help="Another name under which browsers reach the server (a cell.example); repeat."
         ),
     ] = None,
     operate: Annotated[
@@ -107,8 +103,7 @@ def _check_names(hosts: list[str], operator: str | None) -> None:
     for name in hosts:
         if not HOST_NAME.fullmatch(name):
             raise CommandError(
-                "usage",
-                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
+                "usage", f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port"
             )
     if operator is not None:
         try:

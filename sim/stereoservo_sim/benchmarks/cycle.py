@@ -39,15 +39,7 @@ from stereoservo.recording.step_layout import result_crc
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_model
-from stereoservo_sim.world.synthetic import (
-    SEVEN_ROWS,
-    SyntheticCell,
-    dh_link,
-    placed,
-    rotation,
-    rx90,
-    translation,
-)
+from stereoservo_sim.world.synthetic import SEVEN_ROWS, SyntheticCell, dh_link, placed, rotation, rx90, translation
 
 # -- core loop -------------------------------------------------------------------------------------------------
 
@@ -392,13 +384,7 @@ def run_cycle(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
         },
         "core_step_us": core,
         "large_bodies": large_bodies(count, seed, progress),
-        "core": {
-            "joints": 6,
-            "markers": 14,
-            "cameras": 2,
-            "rate_hz": RATE_HZ,
-            "images_hz": RATE_HZ / FRAME_EVERY,
-        },
+        "core": {"joints": 6, "markers": 14, "cameras": 2, "rate_hz": RATE_HZ, "images_hz": RATE_HZ / FRAME_EVERY},
     }
 
 
@@ -528,11 +514,7 @@ def run_scale(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, 
             done += 1
             progress("cells", done, total)
         found[axis] = {"steps": rows, "exponents": exponents(axis, rows)}
-    return {
-        "axes": found,
-        "law": LAW,
-        "at": {"markers": OTHER_MARKERS, "cameras": OTHER_CAMERAS, "joints": 6},
-    }
+    return {"axes": found, "law": LAW, "at": {"markers": OTHER_MARKERS, "cameras": OTHER_CAMERAS, "joints": 6}}
 
 
 def with_markers(count: int) -> SyntheticCell:
@@ -583,10 +565,7 @@ def exponents(axis: str, rows: list[dict[str, Any]]) -> dict[str, dict[str, floa
     for pace in ("tight", "paced"):
         for label in KINDS.values():
             costs = [row[pace][label]["median"] for row in rows]
-            found[f"{pace}, {label}"] = {
-                "all": power(sizes, costs),
-                "last": power(sizes[-2:], costs[-2:]),
-            }
+            found[f"{pace}, {label}"] = {"all": power(sizes, costs), "last": power(sizes[-2:], costs[-2:])}
     return found
 
 

@@ -29,12 +29,7 @@ from stereoservo.client import Client, ClientError, SessionError
 from stereoservo.daemon.heartbeat import HeartbeatReader
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
-from stereoservo.messages.directories import (
-    RUNTIME_VARIABLE,
-    STATE_VARIABLE,
-    CellDirectories,
-    cell_directories,
-)
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonInfo, DaemonProcess
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
@@ -309,11 +304,7 @@ def running_bench() -> Iterator[ServiceBench]:
 
 @contextmanager
 def running_daemon(
-    path: Path,
-    folder: Path,
-    options: tuple[str, ...] = (),
-    environ: dict[str, str] | None = None,
-    code: str = "daemon",
+    path: Path, folder: Path, options: tuple[str, ...] = (), environ: dict[str, str] | None = None, code: str = "daemon"
 ) -> Iterator[DaemonInfo]:
     """The running daemon of a cell file, with its directories in ``folder``; ``environ``: for its processes.
 

@@ -274,8 +274,7 @@ class _Soak:
             self._creeps(before, law)
         elif fastest > MOVING and not blind:
             raise ExperimentError(
-                "moves",
-                f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}",
+                "moves", f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}"
             )
         self.cell.joints.faults = type(self.cell.joints.faults)()  # type: ignore[attr-defined]
         for camera in self.cell.cameras:
@@ -516,8 +515,7 @@ class _LiveSoak:
         self.disk_mb: list[float] = []
         self.told: list[EventMessage] = []
         client.session.declare_subscriber(
-            client.keys.event,
-            lambda sample: self.told.append(decode(sample.payload.to_bytes(), EventMessage)),
+            client.keys.event, lambda sample: self.told.append(decode(sample.payload.to_bytes(), EventMessage))
         )
         self.acts: dict[str, Callable[[], object]] = {
             "stop slot": lambda: raise_stop_slot(bench),

@@ -74,8 +74,7 @@ class CalibrateOptions:
         ),
     ] = False
     trials: Annotated[
-        Path | None,
-        typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
+        Path | None, typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves.")
     ] = None
     images: Annotated[
         Path | None,
@@ -115,8 +114,7 @@ class CalibrateOptions:
         ),
     ] = False
     board: Annotated[
-        str,
-        typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6."),
+        str, typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6.")
     ] = ""
     pitch: Annotated[
         float | None, typer.Option("--pitch", metavar="METRES", help="With --board: distance of its corners [m].")
@@ -124,17 +122,13 @@ class CalibrateOptions:
     layout: Annotated[
         Path | None,
         typer.Option(
-            "--layout",
-            metavar="FILE.csv",
-            help="With --rig: id,x,y [m] of a flat body's markers, where measured.",
+            "--layout", metavar="FILE.csv", help="With --rig: id,x,y [m] of a flat body's markers, where measured."
         ),
     ] = None
     length: Annotated[
         str,
         typer.Option(
-            "--length",
-            metavar="ID,ID=METRES",
-            help="With --rig: distance of two markers of a body of unknown layout.",
+            "--length", metavar="ID,ID=METRES", help="With --rig: distance of two markers of a body of unknown layout."
         ),
     ] = ""
     seconds: Annotated[float, typer.Option("--seconds", help="With --rig, live: how long to watch [s].")] = 60.0
@@ -289,12 +283,7 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
         return run(_telling(client.cell, _lines(what)))
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=1.0)
-        return run(
-            _telling(
-                client.cell,
-                lambda done, told: bar.update(task, completed=done, description=told or what),
-            )
-        )
+        return run(_telling(client.cell, lambda done, told: bar.update(task, completed=done, description=told or what)))
 
 
 def _lines(what: str) -> Callable[[float, str], None]:

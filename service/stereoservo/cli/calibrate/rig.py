@@ -259,8 +259,7 @@ def _live(options: CalibrateOptions) -> RigViews:
     pid = holder(directories.daemon_lock)
     if pid is not None:
         raise CommandError(
-            "daemon_runs",
-            f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording",
+            "daemon_runs", f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording"
         )
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("rig"))
     note(
@@ -337,9 +336,7 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
                 f"{value:.6f} ± {d[name]:.6f}"
                 for name, value in zip(("tx", "ty", "tz"), camera.translation, strict=True)
             )
-            lines += [
-                f"    from {first}: turned by {angle:.4f}° ± {turn:.4f}°, translation {place}{unit}",
-            ]
+            lines += [f"    from {first}: turned by {angle:.4f}° ± {turn:.4f}°, translation {place}{unit}"]
     if result.unit != "m":
         lines.append("  lengths are in baselines: state one (--length ID,ID=METRES) for metres")
     worst = ", ".join(

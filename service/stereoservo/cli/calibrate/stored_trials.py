@@ -21,12 +21,7 @@ from stereoservo.cli.output import CommandError, note
 from stereoservo.core.cycle import Event
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
-from stereoservo.core.sources.measure_at_pose import (
-    add_observation,
-    averages,
-    measurement_buffers,
-    too_few_seen,
-)
+from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers, too_few_seen
 from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
 from stereoservo.daemon.jobs.fit_job import report_folder
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
@@ -219,9 +214,7 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
         except GeometryError as error:
             names = ", ".join(repr(line) for line in of_camera)
             raise CommandError(
-                "lines",
-                f"{path}: lines of camera {camera!r} ({names}, counted from 0): {error}",
-                camera=camera,
+                "lines", f"{path}: lines of camera {camera!r} ({names}, counted from 0): {error}", camera=camera
             ) from error
     names_of = {camera: tuple(of_camera) for camera, of_camera in found.items()}
     return lenses, LinesUsed(str(path), sigma, names_of)
@@ -263,8 +256,7 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
 
     if not cell.endswith(".toml"):
         raise CommandError(
-            "usage",
-            f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml",
+            "usage", f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml"
         )
     resolve_cell(cell, output)
 

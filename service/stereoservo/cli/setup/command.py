@@ -62,8 +62,7 @@ WATCH_S = 2.0
 
 def setup(
     file: Annotated[
-        Path,
-        typer.Argument(metavar="FILE", help="The cell file to write, e.g. mycell.toml, or to go on with."),
+        Path, typer.Argument(metavar="FILE", help="The cell file to write, e.g. mycell.toml, or to go on with.")
     ],
     answers: Annotated[
         Path | None,
@@ -169,9 +168,7 @@ def _commissioned(
     elif any(finding.name.endswith(" jog") for finding in findings):
         raise CommandError("not_commissioned", "not every joint was moved; the same command goes on from here")
     elif not dialogue.confirm(
-        "unexamined",
-        f"Driver {plan.joints.driver!r} moves no joint for setup. Was each tried by itself?",
-        False,
+        "unexamined", f"Driver {plan.joints.driver!r} moves no joint for setup. Was each tried by itself?", False
     ):
         raise CommandError("not_commissioned", "`stereoservo driver-check --cell FILE --hardware` tries them")
 

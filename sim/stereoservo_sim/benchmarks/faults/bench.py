@@ -220,13 +220,7 @@ def run_wall(repetitions: int, progress: Callable[[int, int], None]) -> dict[str
 
 
 def _row(
-    emulator: EmulatorProcess,
-    options: CanOptions,
-    fault: str,
-    order: str,
-    cure: str,
-    bound_ms: float,
-    repetitions: int,
+    emulator: EmulatorProcess, options: CanOptions, fault: str, order: str, cure: str, bound_ms: float, repetitions: int
 ) -> dict[str, Any]:
     trials: list[dict[str, Any]] = []
     stalled: list[str] = []
@@ -529,11 +523,7 @@ def _in_common(sentences: list[str]) -> str:
 
 def _markdown_table(columns: dict[str, str], rows: list[dict[str, str]]) -> str:
     """A table of ``columns``, heading by cell."""
-    lines = [
-        list(columns.values()),
-        ["---"] * len(columns),
-        *([row[name] for name in columns] for row in rows),
-    ]
+    lines = [list(columns.values()), ["---"] * len(columns), *([row[name] for name in columns] for row in rows)]
     return "\n".join(map(_line, lines))
 
 

@@ -27,15 +27,7 @@ from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo_drivers.kit.timing import StallWatch
 from stereoservo_sim.benchmarks import service_bench
-from stereoservo_sim.benchmarks.service_bench import (
-    CELL,
-    END,
-    SPEED_SCALE,
-    ServiceBench,
-    VoidTrialError,
-    during,
-    send,
-)
+from stereoservo_sim.benchmarks.service_bench import CELL, END, SPEED_SCALE, ServiceBench, VoidTrialError, during, send
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.world.history import TrueJointHistory
 
@@ -434,8 +426,7 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     client = Client(CELL)
     told_live: list[EventMessage] = []
     client.session.declare_subscriber(
-        client.keys.event,
-        lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage)),
+        client.keys.event, lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage))
     )
     try:
         if fault.client:

@@ -222,14 +222,7 @@ class BusEmulator:
     or plugged in again (True).
     """
 
-    def __init__(
-        self,
-        nodes: Sequence[EmulatedNode],
-        plant: AxisPlant,
-        *,
-        bitrate: int | None,
-        t_ns: int,
-    ) -> None:
+    def __init__(self, nodes: Sequence[EmulatedNode], plant: AxisPlant, *, bitrate: int | None, t_ns: int) -> None:
         self.t_ns = t_ns
         self.start_ns = t_ns
         self.plant = plant

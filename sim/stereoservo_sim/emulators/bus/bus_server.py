@@ -76,11 +76,7 @@ class BusServer:
     """
 
     def __init__(
-        self,
-        emulator: BusEmulator,
-        endpoint: Endpoint,
-        *,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        self, emulator: BusEmulator, endpoint: Endpoint, *, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.emulator = emulator
         self.endpoint = endpoint

@@ -42,13 +42,7 @@ NO_DEADLINE = {"rpdo_deadline_ms": 0}
 """The drives' deadline for commands is off: their heartbeat monitor (0x1016) of the master acts alone."""
 
 EITHER_PROTOCOL = (
-    FaultCase(
-        name="node silent",
-        orders=("silence 4",),
-        codes=("silent",),
-        bound_ms=60,
-        afterwards=("speak 4",),
-    ),
+    FaultCase(name="node silent", orders=("silence 4",), codes=("silent",), bound_ms=60, afterwards=("speak 4",)),
     FaultCase(
         name="duplicate node id running",
         orders=("duplicate 2 running",),
@@ -82,11 +76,7 @@ EITHER_PROTOCOL = (
         stage="start",
     ),
     FaultCase(
-        name="node missing at start",
-        orders=("silence 4",),
-        codes=("node_missing",),
-        by="bring-up",
-        stage="start",
+        name="node missing at start", orders=("silence 4",), codes=("node_missing",), by="bring-up", stage="start"
     ),
     FaultCase(name="servo loop hangs", host="loop_hangs", codes=("loop_hung",), bound_ms=150),
 )
@@ -95,18 +85,11 @@ EITHER_PROTOCOL = (
 CIA402_CASES = (
     *EITHER_PROTOCOL,
     FaultCase(
-        name="drive fault with emergency",
-        orders=("fault 3 0x3210",),
-        codes=("emergency", "drive_fault"),
-        bound_ms=40,
+        name="drive fault with emergency", orders=("fault 3 0x3210",), codes=("emergency", "drive_fault"), bound_ms=40
     ),
     FaultCase(name="emergency alone", orders=("emcy 5 0x4210",), codes=("emergency",), bound_ms=40),
     FaultCase(
-        name="node's cable out",
-        orders=("cable 4 out",),
-        codes=("silent",),
-        bound_ms=60,
-        afterwards=("cable 4 in",),
+        name="node's cable out", orders=("cable 4 out",), codes=("silent",), bound_ms=60, afterwards=("cable 4 in",)
     ),
     FaultCase(name="node reboots", orders=("reboot 5",), codes=("rebooted", "silent"), bound_ms=60),
     FaultCase(name="one TPDO lost", orders=("lose 2 tpdo1",), by="nobody"),
@@ -155,11 +138,7 @@ CIA402_CASES = (
         options=NO_DEADLINE,
     ),
     FaultCase(
-        name="cycle thread hangs, RPDO deadline",
-        host="cycle_hangs",
-        codes=AFTER_A_HANG,
-        bound_ms=60,
-        by="drives",
+        name="cycle thread hangs, RPDO deadline", host="cycle_hangs", codes=AFTER_A_HANG, bound_ms=60, by="drives"
     ),
     FaultCase(
         name="adapter gone",
@@ -171,13 +150,7 @@ CIA402_CASES = (
         options=NO_DEADLINE,
         afterwards=("adapter in",),
     ),
-    FaultCase(
-        name="SYNC lost",
-        orders=("drop-sync",),
-        codes=("bus_silent",),
-        bound_ms=60,
-        afterwards=("pass-sync",),
-    ),
+    FaultCase(name="SYNC lost", orders=("drop-sync",), codes=("bus_silent",), bound_ms=60, afterwards=("pass-sync",)),
     FaultCase(
         name="limit switch",
         options={"feedback": ("velocity", "switches")},
@@ -208,13 +181,7 @@ CIA402_CASES = (
         codes=("rebooted", "silent", "left_operational"),
         bound_ms=60,
     ),
-    FaultCase(
-        name="babbling node",
-        orders=("flood 1",),
-        codes=("bus_flood",),
-        bound_ms=60,
-        afterwards=("calm 1",),
-    ),
+    FaultCase(name="babbling node", orders=("flood 1",), codes=("bus_flood",), bound_ms=60, afterwards=("calm 1",)),
     FaultCase(
         name="encoder runs against the command",
         orders=("invert 3",),
@@ -223,10 +190,7 @@ CIA402_CASES = (
         afterwards=("invert 3 off",),
     ),
     FaultCase(
-        name="drive in fault at start",
-        orders=("fault 3 0x3210",),
-        codes=("drive_fault", "emergency"),
-        stage="start",
+        name="drive in fault at start", orders=("fault 3 0x3210",), codes=("drive_fault", "emergency"), stage="start"
     ),
     FaultCase(
         name="cause that stays: reset refused",

@@ -81,11 +81,7 @@ def trial_options(protocol: str, **changes: object) -> CanOptions:
         for k in range(1, AXES + 1)
     )
     base = CanOptions(
-        protocol="odrive" if odrive else "cia402",
-        interface="virtual",
-        channel="trial",
-        rate_hz=RATE_HZ,
-        joint=joints,
+        protocol="odrive" if odrive else "cia402", interface="virtual", channel="trial", rate_hz=RATE_HZ, joint=joints
     )
     return msgspec.structs.replace(base, **changes)
 

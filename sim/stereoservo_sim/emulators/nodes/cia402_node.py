@@ -46,13 +46,7 @@ class Cia402Node:
     """
 
     def __init__(
-        self,
-        node_id: int,
-        axis: EmulatedAxis,
-        joint: CanJoint,
-        *,
-        eds: Path,
-        settings: NodeSettings | None = None,
+        self, node_id: int, axis: EmulatedAxis, joint: CanJoint, *, eds: Path, settings: NodeSettings | None = None
     ) -> None:
         self.node_id = node_id
         self.axis = axis
@@ -326,10 +320,7 @@ class Cia402Node:
     def _settle(self) -> None:
         """Update motion, event-driven TPDOs and emergencies to the present."""
         t_ns = self._t_ns
-        if self.motion.step(t_ns) and self.machine.state not in (
-            Cia402State.FAULT_REACTION,
-            Cia402State.FAULT,
-        ):
+        if self.motion.step(t_ns) and self.machine.state not in (Cia402State.FAULT_REACTION, Cia402State.FAULT):
             self._fault(FOLLOWING_ERROR)
             self.motion.step(t_ns)
         self.motion.warning = bool(self.emergencies.active)

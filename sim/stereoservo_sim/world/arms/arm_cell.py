@@ -151,12 +151,7 @@ def _joint(element: Element, links: dict[str, Element], path: Path) -> UrdfJoint
 
 
 def _number(
-    element: Element,
-    key: str,
-    path: Path,
-    default: str = "0",
-    least: float = -LARGEST,
-    most: float = LARGEST,
+    element: Element, key: str, path: Path, default: str = "0", least: float = -LARGEST, most: float = LARGEST
 ) -> float:
     text = element.get(key, default)
     try:
