@@ -35,8 +35,7 @@ from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
 from stereoservo_drivers.canopen.codec import Bringup, Codec
 from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
-from stereoservo_drivers.canopen.odrive import OdriveCodec
-from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
+from stereoservo_drivers.canopen.odrive import OdriveBringup, OdriveCodec
 from stereoservo_drivers.canopen.option_checks import check_options
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, can_options
 from stereoservo_drivers.kit.auxiliary import verify_order

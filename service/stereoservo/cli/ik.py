@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from stereoservo.cli.goal import make_goal, target_tree
 from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, SetPointsOption, emit
-from stereoservo.cli.target_options import make_goal, target_tree
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError
 from stereoservo.messages.cell_file import CellFile, load_cell_file

@@ -22,7 +22,7 @@ from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
 from stereoservo_sim.emulators.bus.fault_trials import VirtualHost
 from stereoservo_sim.emulators.nodes.cia402_node import Cia402Node
-from stereoservo_sim.emulators.nodes.dictionary import Abort, SdoError
+from stereoservo_sim.emulators.nodes.communication import Abort, SdoError
 
 COUNTS, GEAR = 4096, 100.0
 COUNTS_PER_RAD = COUNTS * GEAR / (2 * math.pi)

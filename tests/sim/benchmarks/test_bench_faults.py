@@ -15,7 +15,7 @@ from rich.console import Console
 from stereoservo.cli import main as cli
 from stereoservo_sim.benchmarks.faults import bench, inputs, service
 from stereoservo_sim.benchmarks.faults.bench import distinct_sentences, reliability_page
-from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
+from stereoservo_sim.emulators.bus.fault_trials import ODRIVE_CASES, FaultCase
 
 
 @pytest.fixture

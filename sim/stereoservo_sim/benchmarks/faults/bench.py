@@ -35,9 +35,9 @@ from stereoservo_sim.benchmarks.faults.service import run_service
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.emulators.bus.factory import drives_of_cell
-from stereoservo_sim.emulators.bus.fault_cases import CASES
 from stereoservo_sim.emulators.bus.fault_trials import (
     AXES,
+    CASES,
     RAMP_COUNTS_S2,
     RATE_HZ,
     SPEED_COUNTS_S,

@@ -10,8 +10,15 @@ from pathlib import Path
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_sim.emulators.nodes.communication import DEADLINE, ProcessData, SdoServer
-from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoError, Value
+from stereoservo_sim.emulators.nodes.communication import (
+    DEADLINE,
+    Abort,
+    Dictionary,
+    ProcessData,
+    SdoError,
+    SdoServer,
+    Value,
+)
 from stereoservo_sim.emulators.nodes.drive_motion import (
     CYCLIC_VELOCITY,
     FOLLOWING_ERROR,

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import Enum, IntEnum, StrEnum
 
 from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_sim.emulators.nodes.dictionary import Dictionary
+from stereoservo_sim.emulators.nodes.communication import Dictionary
 from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_sim.emulators.bus.fault_cases import CASES, CIA402_CASES, FaultCase
 from stereoservo_sim.emulators.bus.fault_trials import (
+    CASES,
+    CIA402_CASES,
+    FaultCase,
     FaultRig,
     Trial,
     run_row,
