@@ -232,10 +232,8 @@ class Cia402Bringup:
             drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
         off = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
         if not until(link, lambda: _state(drive) in off, REST_S if state in FAULTY else STATE_S):
-            raise DriverError(
-                "not_off",
-                f"{drive.name}: does not switch off, it says {drive.axis.words()!r}; switch its supply off and on",
-                node_id=drive.node_id,
+            raise drive.error(
+                "not_off", f"does not switch off, it says {drive.axis.words()!r}; switch its supply off and on"
             )
 
     def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> None:
@@ -326,12 +324,11 @@ class Cia402Bringup:
         found = drive.read(write.index, write.subindex)
         if not write.agrees(found):
             name = drive.object_name(write.index, write.subindex)
-            raise DriverError(
+            raise drive.error(
                 "read_back",
-                f"{drive.name}: {name} reads {found} (0x{found & 0xFFFFFFFF:X}), "
+                f"{name} reads {found} (0x{found & 0xFFFFFFFF:X}), "
                 f"written was {write.value} (0x{write.value & 0xFFFFFFFF:X}); the drive limits or ignores it: set "
                 f"{write.option or 'the drive up so'} that it fits",
-                node_id=drive.node_id,
                 object=f"0x{write.index:04X}:{write.subindex}",
                 written=write.value,
                 found=found,
@@ -353,12 +350,11 @@ class Cia402Bringup:
             for drive in drives:
                 heartbeats = received[HEARTBEAT_ID + drive.node_id]
                 if not until(link, _reports(heartbeats, NmtState.OPERATIONAL), limit_s):
-                    raise DriverError(
+                    raise drive.error(
                         "not_operational",
-                        f"{drive.name}: no heartbeat says operational within {limit_s:g} s after NMT start; "
+                        f"no heartbeat says operational within {limit_s:g} s after NMT start; "
                         f"{len(heartbeats)} heartbeats came",
                         retry=True,
-                        node_id=drive.node_id,
                     )
         self.codec.watch()
 
@@ -372,12 +368,10 @@ class Cia402Bringup:
             for drive in drives:
                 heartbeats = received[HEARTBEAT_ID + drive.node_id]
                 if not until(link, _reports(heartbeats, NmtState.BOOT_UP), BOOT_S):
-                    raise DriverError(
+                    raise drive.error(
                         "no_boot_up",
-                        f"{drive.name}: no boot-up within {BOOT_S:g} s after NMT reset communication; switch its "
-                        "supply off and on",
+                        f"no boot-up within {BOOT_S:g} s after NMT reset communication; switch its supply off and on",
                         retry=True,
-                        node_id=drive.node_id,
                     )
 
     def _clear_fault(self, link: Link, drive: RemoteDrive) -> None:
@@ -407,12 +401,11 @@ class Cia402Bringup:
     @staticmethod
     def _stays(drive: RemoteDrive) -> DriverError:
         code = drive.read_if_there(0x603F) or (drive.axis.codes[-1] if drive.axis.codes else 0)
-        return DriverError(
+        return drive.error(
             "fault_stays",
-            f"{drive.name}: {error_words(code)} is still there after the reset (state {drive.axis.state.value!r}); "
+            f"{error_words(code)} is still there after the reset (state {drive.axis.state.value!r}); "
             f"remove the cause first: {error_hint(code)}",
             retry=True,
-            node_id=drive.node_id,
             error_code=code,
             state=drive.axis.state.value,
         )

@@ -121,11 +121,10 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
     if not set(watches) - {"deadline"}:
         unwatched = NO_WATCH + ONLY_DEADLINE * bool(watches)
         if "watch" not in joint.accept_missing:
-            raise DriverError(
+            raise drive.error(
                 "no_watch",
-                f"{drive.name}: {unwatched}. If this computer dies, it goes on with the last command that it got. Cut "
+                f"{unwatched}. If this computer dies, it goes on with the last command that it got. Cut "
                 'its power by a safety relay, and say that you know: accept_missing = ["watch"] of this joint',
-                node_id=drive.node_id,
                 joint=joint.name,
             )
         losses.insert(0, f"{unwatched}, as accept_missing acknowledges")
@@ -155,12 +154,7 @@ def _modes(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> tuple[
     told = "none" if has.modes is None else f"0x{has.modes:08X}"
     number = "" if options.mode == "auto" else f" {MODES[options.mode]} ({options.mode})"
     able = ", ".join(there) or "none of csv, pv, csp and ip: this drive cannot be used"
-    raise DriverError(
-        "mode",
-        f"{drive.name}: the drive has no mode{number}, 0x6502 is {told}; set mode to {able}",
-        node_id=drive.node_id,
-        modes=has.modes,
-    )
+    raise drive.error("mode", f"the drive has no mode{number}, 0x6502 is {told}; set mode to {able}", modes=has.modes)
 
 
 def usable(mode: CommandMode, has: Capabilities) -> bool:

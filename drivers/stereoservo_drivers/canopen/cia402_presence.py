@@ -51,13 +51,12 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
     for drive in drives:
         count = len(received[RPDO_IDS[0] + drive.node_id])
         if count:
-            raise DriverError(
+            raise drive.error(
                 "second_master",
-                f"{drive.name}: somebody else commands this drive, {count} frames 0x{RPDO_IDS[0] + drive.node_id:X} "
+                f"somebody else commands this drive, {count} frames 0x{RPDO_IDS[0] + drive.node_id:X} "
                 f"within {ALONE_S * 1e3:.0f} ms; end the other master (another daemon or doctor on this bus, a "
                 "maker's commissioning tool) first",
                 retry=True,
-                node_id=drive.node_id,
                 frames=count,
             )
 
@@ -81,12 +80,11 @@ def _check_boots(
 ) -> None:
     for drive in drives:
         if any(frame.data == BOOT_UP for frame in received[HEARTBEAT_ID + drive.node_id]):
-            raise DriverError(
+            raise drive.error(
                 "rebooted",
-                f"{drive.name}: booted while it was configured and has forgotten what was written; is its supply "
+                "booted while it was configured and has forgotten what was written; is its supply "
                 "sound, does another master reset it? Try again",
                 retry=True,
-                node_id=drive.node_id,
             ) from consequence
 
 
@@ -118,11 +116,10 @@ def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
                 "unknown" if frame.data[:1] == ABORT else f"{int.from_bytes(frame.data[4:8], 'little')}"
                 for frame in answers[drive.node_id]
             )
-            raise DriverError(
+            raise drive.error(
                 "duplicate_node",
-                f"{drive.name}: {count} nodes answer to this id (serial numbers {serials}); disconnect all but one "
+                f"{count} nodes answer to this id (serial numbers {serials}); disconnect all but one "
                 "and give each an id of its own",
-                node_id=drive.node_id,
                 answers=count,
             )
 
@@ -153,22 +150,20 @@ def identify(drive: RemoteDrive, eds: Path) -> Identity:
     """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``)."""
     device_type = drive.read(0x1000)
     if device_type & 0xFFFF != CIA_402:
-        raise DriverError(
+        raise drive.error(
             "not_a_drive",
-            f"{drive.name}: device type is 0x{device_type:08X} (profile {device_type & 0xFFFF}), not a drive "
+            f"device type is 0x{device_type:08X} (profile {device_type & 0xFFFF}), not a drive "
             f"(profile {CIA_402}); is node_id right?",
-            node_id=drive.node_id,
             device_type=device_type,
         )
     identity = Identity(*(drive.read_if_there(0x1018, subindex) for subindex in (1, 2, 3, 4)))
     for key in IDENTITY:
         expected, found = getattr(drive.axis.joint, key), getattr(identity, key)
         if expected is not None and expected != found:
-            raise DriverError(
+            raise drive.error(
                 "identity",
-                f"{drive.name}: {key} is {_number(found)}, the cell file says {_number(expected)}; was the drive "
+                f"{key} is {_number(found)}, the cell file says {_number(expected)}; was the drive "
                 "exchanged, or are node ids swapped?",
-                node_id=drive.node_id,
                 key=key,
                 found=found,
                 wanted=expected,
@@ -191,11 +186,10 @@ def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
         ("product", of.product_number, identity.product_code),
     ):
         if in_eds and found is not None and in_eds != found:
-            raise DriverError(
+            raise drive.error(
                 "wrong_eds",
-                f"{drive.name}: {eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "
+                f"{eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "
                 f"the drive is {key} 0x{found:X}; take the drive's own EDS, or leave eds out",
-                node_id=drive.node_id,
                 eds=str(eds),
                 in_eds=in_eds,
                 found=found,

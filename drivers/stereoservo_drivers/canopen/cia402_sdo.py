@@ -108,6 +108,10 @@ class RemoteDrive:
     ) -> None:
         self._link.unsubscribe(self._client.tx_cobid, self._client.heard)
 
+    def error(self, code: str, message: str, *, retry: bool = False, **data: Any) -> DriverError:
+        """An error of this drive, whose name precedes the ``message``."""
+        return DriverError(code, f"{self.name}: {message}", retry=retry, node_id=self.node_id, **data)
+
     def nmt(self, command: str) -> None:
         """Send an NMT command of CiA 301 by name: ``OPERATIONAL``, ``PRE-OPERATIONAL``, ``RESET COMMUNICATION``."""
         self._nmt.send_command(NMT_COMMANDS[command])

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, RPDO_IDS, STATUS_AND_POSITION, TPDO_IDS, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
@@ -98,11 +97,10 @@ class Gripper:
         """The safest configuration of its drive. Raises DriverError (``mode``)."""
         if (has.modes is not None and not has.modes & 1 << PROFILE_POSITION - 1) or not has.has(TARGET_POSITION):
             told = "not told" if has.modes is None else f"0x{has.modes:08X}"
-            raise DriverError(
+            raise drive.error(
                 "mode",
-                f"{drive.name}: a gripper's drive needs profile position (mode 1, 0x607A), 0x6502 is {told}; use "
+                f"a gripper's drive needs profile position (mode 1, 0x607A), 0x6502 is {told}; use "
                 "another drive, or a gripper on a digital output ([[joints.options.output]])",
-                node_id=drive.node_id,
                 modes=has.modes,
             )
         losses = tuple(text for key, text in LOSSES.items() if not has.has(key))

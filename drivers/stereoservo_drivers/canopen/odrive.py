@@ -17,6 +17,7 @@ import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -146,6 +147,10 @@ class Axis:
     @property
     def name(self) -> str:
         return f"axis {self.joint.name!r} (node {self.node_id})"
+
+    def error(self, code: str, message: str, *, retry: bool = False, **data: Any) -> DriverError:
+        """An error of this axis, whose name precedes the ``message``."""
+        return DriverError(code, f"{self.name}{message}", retry=retry, node_id=self.node_id, **data)
 
     def remote(self, command: int) -> CanFrame:
         return CanFrame(frame_id(self.node_id, command), remote=True, length=_DATA)
@@ -422,11 +427,10 @@ class OdriveBringup:
             self.codec.receive(answers[-1])
             if axis.errors:
                 words = error_words(axis.errors)
-                raise DriverError(
+                raise axis.error(
                     "reset_refused",
-                    f"{axis.name}: {words} stays after Clear_Errors; remove the cause first",
+                    f": {words} stays after Clear_Errors; remove the cause first",
                     retry=True,
-                    node_id=node,
                     errors=axis.errors,
                 )
         self._await_idle(link)
@@ -447,11 +451,8 @@ class OdriveBringup:
         answers = {node: [f for f in frames if not f.remote] for node, frames in received.items()}
         for node, frames in answers.items():
             if not frames:
-                raise DriverError(
-                    "no_answer",
-                    f"{self._axes[node].name}: no answer to command 0x{command:02X} in {ANSWER_WAIT_S} s",
-                    retry=True,
-                    node_id=node,
+                raise self._axes[node].error(
+                    "no_answer", f": no answer to command 0x{command:02X} in {ANSWER_WAIT_S} s", retry=True
                 )
         return answers
 
@@ -461,12 +462,11 @@ class OdriveBringup:
             link.wait(QUIET_S)
         for node, frames in received.items():
             if frames:
-                raise DriverError(
+                raise self._axes[node].error(
                     "second_master",
-                    f"{self._axes[node].name}: somebody else commands this axis, {len(frames)} velocities within "
+                    f": somebody else commands this axis, {len(frames)} velocities within "
                     f"{QUIET_S} s; end the other master (another daemon or doctor on this bus) first",
                     retry=True,
-                    node_id=node,
                     frames=len(frames),
                 )
 
@@ -494,10 +494,9 @@ class OdriveBringup:
             if len(answers) > 1:
                 raise _duplicate(node, f"serial numbers {', '.join(f'0x{s:012X}' for s in serials)}")
             if axis.joint.serial_number not in (None, serials[0]):
-                raise DriverError(
+                raise axis.error(
                     "identity",
-                    f"{axis.name} has serial number {serials[0]}, the cell file says {axis.joint.serial_number}",
-                    node_id=node,
+                    f" has serial number {serials[0]}, the cell file says {axis.joint.serial_number}",
                     serial_number=serials[0],
                 )
 
@@ -507,11 +506,10 @@ class OdriveBringup:
                 raise _duplicate(node, "two versions")
             data = answers[0].data
             if len(data) != 8 or data[0] != PROTOCOL_VERSION:
-                raise DriverError(
+                raise self._axes[node].error(
                     "version",
-                    f"{self._axes[node].name} answers {data.hex(' ')} to Get_Version; protocol version "
+                    f" answers {data.hex(' ')} to Get_Version; protocol version "
                     f"{PROTOCOL_VERSION} (firmware 0.6) is needed",
-                    node_id=node,
                 )
             self.firmware[node] = ".".join(str(number) for number in data[4:7])
             self._hardware[node] = ".".join(str(number) for number in data[1:4])
@@ -522,21 +520,18 @@ class OdriveBringup:
             link.wait(QUIET_S)
         for node, frames in unasked.items():
             if frames:
-                raise DriverError(
+                raise self._axes[node].error(
                     "cyclic_messages",
-                    f"{self._axes[node].name} sends encoder estimates unasked, {len(frames)} in {QUIET_S} s; set "
+                    f" sends encoder estimates unasked, {len(frames)} in {QUIET_S} s; set "
                     "axis0.config.can.encoder_msg_rate_ms = 0",
-                    node_id=node,
                 )
         for node, answers in self._ask(link, GET_ENCODER_ESTIMATES).items():
             if len(answers) > 1:
                 raise _duplicate(node, f"{len(answers)} encoder estimates")
             if self.codec.receive(answers[0]) < 0:
-                raise DriverError(
+                raise self._axes[node].error(
                     "no_feedback",
-                    f"{self._axes[node].name}: encoder estimates {answers[0].data.hex(' ')} are not two finite "
-                    "float32; calibrate the encoder",
-                    node_id=node,
+                    f": encoder estimates {answers[0].data.hex(' ')} are not two finite float32; calibrate the encoder",
                 )
 
     def _set_up(self, link: Link) -> None:

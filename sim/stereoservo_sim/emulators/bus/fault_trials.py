@@ -68,8 +68,8 @@ def _case(
     name: str, orders: str = "", codes: str = "", bound_ms: float | None = None, afterwards: str = "", **more: Any
 ) -> FaultCase:
     """A fault case whose orders and codes are given as one text, separated by ``, ``."""
-    split = (tuple(filter(None, text.split(", "))) for text in (orders, codes, afterwards))
-    return FaultCase(name, *split, bound_ms, **more)
+    first, latched, last = (tuple(filter(None, text.split(", "))) for text in (orders, codes, afterwards))
+    return FaultCase(name, first, latched, last, bound_ms, **more)
 
 
 EITHER_PROTOCOL = (
