@@ -407,7 +407,7 @@ def test_a_full_disk_behind_stderr_loses_a_remark_alone(monkeypatch: pytest.Monk
     full = Path("/dev/full").open("w", buffering=1)  # noqa: SIM115 - what it holds is never written
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", full)
-        output.note("the cell is up")
+        output.log("the cell is up")
     with suppress(OSError):
         full.close()
 

@@ -36,11 +36,11 @@ class ArmInPictures:
         self.readings = world.base + away * self.rng.uniform(-1, 1, len(world.base)) - self.off
         self.moves: list[np.ndarray] = []
 
-    def look(self, *_: Any) -> home.Look:
+    def look(self, *_: Any) -> home.Observation:
         model = self.arm.model
         pixels = predicted_pixels(seen_chain(model), (self.readings + self.off)[None], model.marker_points)[0]
         pixels += self.rng.normal(0, NOISE_PX, pixels.shape)
-        return home.Look(self.readings.copy(), pixels, np.full(pixels.shape[:2], SIGMA_PX))
+        return home.Observation(self.readings.copy(), pixels, np.full(pixels.shape[:2], SIGMA_PX))
 
     def move(self, client: Any, arm: LearntArm, readings: np.ndarray, speed_scale: float) -> None:
         self.moves.append(readings - self.readings)

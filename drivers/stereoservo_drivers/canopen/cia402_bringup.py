@@ -37,7 +37,13 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     unwatch_writes,
     watch_writes,
 )
-from stereoservo_drivers.canopen.cia402_presence import Identity, alone, find, identify, unbroken
+from stereoservo_drivers.canopen.cia402_presence import (
+    Identity,
+    identify,
+    reject_reboots,
+    require_nodes,
+    require_single_master,
+)
 from stereoservo_drivers.canopen.cia402_words import (
     ABORT_READ_ONLY,
     FAULTY,
@@ -105,14 +111,14 @@ class Cia402Bringup:
         """
         self._ignore()
         with self._drives(link) as drives:
-            alone(link, drives)
+            require_single_master(link, drives)
             # Axes that a dead master has left moving: before anything that can fail, and while they accept process
             # data.
             link.send(self.codec.quick_stop())
             link.wait(TAKEN_S)
-            with unbroken(link, drives):
-                self._quiet(drives)
-                find(link, drives, self._options)
+            with reject_reboots(link, drives):
+                self._enter_pre_operational(drives)
+                require_nodes(link, drives, self._options)
                 self._prepare(link, drives)
                 self._start(link, drives)
         self.outputs.listen(link)
@@ -127,10 +133,10 @@ class Cia402Bringup:
         """
         self._ignore()
         with self._drives(link) as drives:
-            self._quiet(drives)
-            find(link, drives, self._options)
+            self._enter_pre_operational(drives)
+            require_nodes(link, drives, self._options)
             self._reset_communication(link, [drive for drive in drives if _lost_the_bus(drive)])
-            with unbroken(link, drives):
+            with reject_reboots(link, drives):
                 self._prepare(link, drives)
                 stays: DriverError | None = None
                 try:
@@ -196,7 +202,7 @@ class Cia402Bringup:
         for gripper in self.grippers.values():
             gripper.ignore()
 
-    def _quiet(self, drives: list[RemoteDrive]) -> None:
+    def _enter_pre_operational(self, drives: list[RemoteDrive]) -> None:
         for drive in drives:
             drive.nmt("PRE-OPERATIONAL")
 
@@ -251,14 +257,14 @@ class Cia402Bringup:
         for write in (*first, *identifiers, *off, *parameters):
             drive.write(write.index, write.subindex, write.value, write.option)
         if gripper is None:
-            rest = self._take_mode(link, drive, setup, feedback)
+            rest = self._set_mode(link, drive, setup, feedback)
         else:
-            rest = gripper.take_mode(link, drive)
+            rest = gripper.set_mode(link, drive)
         for write in {write.key: write for write in (*identifiers, *off, *parameters, *rest)}.values():
             self._compare(drive, write)
         self.outputs.prepare(drive)
 
-    def _take_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
+    def _set_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
         """Write mode, period and PDOs of a joint's drive; returns the writes to read back. Raises DriverError."""
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
@@ -424,7 +430,7 @@ def _out_of_range(error: DriverError) -> bool:
 
 def _state(drive: RemoteDrive) -> DriveState:
     """Drive state read by SDO; the codec stores it as the newest."""
-    drive.axis.take_status(drive.read(0x6041))
+    drive.axis.set_status_word(drive.read(0x6041))
     return drive.axis.state
 
 
@@ -447,7 +453,7 @@ def _read_initial_state(drive: RemoteDrive) -> None:
     """Read state, error code and limit switches before the first cycle."""
     axis = drive.axis
     if _state(drive) in FAULTY:
-        axis.take_code(drive.read_if_there(0x603F) or 0)
+        axis.add_error_code(drive.read_if_there(0x603F) or 0)
     if axis.at_limit:
         switches = drive.read_if_there(0x60FD) or 0
         axis.limit_side = axis.joint.direction * ((switches >> 1 & 1) - (switches & 1))

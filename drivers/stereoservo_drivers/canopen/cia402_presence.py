@@ -42,7 +42,7 @@ class Identity:
     serial_number: int | None
 
 
-def alone(link: Link, drives: list[RemoteDrive]) -> None:
+def require_single_master(link: Link, drives: list[RemoteDrive]) -> None:
     """Check, before anything is sent, that no other master commands these drives. Raises DriverError
     (``second_master``).
     """
@@ -62,7 +62,7 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
 
 
 @contextmanager
-def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
+def reject_reboots(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
     """Context manager that raises DriverError (``rebooted``) at its end if a drive has booted meanwhile and lost its
     configuration.
     """
@@ -88,7 +88,7 @@ def _check_boots(
             ) from consequence
 
 
-def ask(
+def read_from_nodes(
     link: Link, nodes: list[int], index: int, subindex: int, patience_s: float = PROBE_S
 ) -> dict[int, list[CanFrame]]:
     """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
@@ -103,9 +103,9 @@ def ask(
     return {node: received[0x580 + node] for node in nodes}
 
 
-def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
+def require_nodes(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
     """One reply of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
-    answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
+    answers = read_from_nodes(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
     missing = [drive for drive in drives if not answers[drive.node_id]]
     if missing:
         raise _missing(link, missing, drives, options)
@@ -126,7 +126,7 @@ def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
 
 def _missing(link: Link, missing: list[RemoteDrive], drives: list[RemoteDrive], options: CanOptions) -> DriverError:
     configured = [drive.node_id for drive in drives]
-    others = ask(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
+    others = read_from_nodes(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
     absent = [drive.node_id for drive in missing]
     present = sorted({*configured} - {*absent} | {node for node, answers in others.items() if answers})
     names = ", ".join(drive.name for drive in missing)

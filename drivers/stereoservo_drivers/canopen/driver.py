@@ -163,7 +163,7 @@ class CanJointDriver:
     def _await_rest(self) -> None:
         """Wait for the end of the quick stop before the cycle ends. Raises DriverError if the arm keeps moving."""
         limit_s = self.master.stop_limit_s
-        if self._wait(lambda: self.master.stands() is True, limit_s) or self.master.stands() is None:
+        if self._wait(lambda: self.master.at_rest() is True, limit_s) or self.master.at_rest() is None:
             return
         sample = self.master.sample()
         speeds = [] if sample is None else np.round(sample.velocities, 4).tolist()
@@ -228,7 +228,7 @@ class CanJointDriver:
             self.master.latch(MasterFault(error.code, str(error)))
         bus = self.bus
         if bus is not None and bus.alive:
-            self._wait(lambda: self.master.stands() is True, self.master.stop_limit_s)
+            self._wait(lambda: self.master.at_rest() is True, self.master.stop_limit_s)
             try:
                 bus.end_cycle()
                 self.bringup.release(bus)

@@ -119,7 +119,7 @@ class Gripper:
             writes.append(Write(*TORQUE_LIMIT, self.gripper.torque_limit, option="torque_limit"))
         return writes
 
-    def take_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
+    def set_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
         """Write mode and PDOs; returns the writes to read back. Raises DriverError."""
         rpdo, tpdo = (RPDO_COMMUNICATION, RPDO_MAPPING), (TPDO_COMMUNICATION, TPDO_MAPPING)
         node, target = drive.node_id, TARGET_POSITION[0] << 16 | 32
@@ -197,7 +197,7 @@ class Gripper:
         while self._emergencies:
             data = self._emergencies.pop(0).data
             code = int.from_bytes(data[:2], "little")
-            self.axis.take_code(code)
+            self.axis.add_error_code(code)
             if code and code not in self._options.emcy_ignore:
                 found = self._fault("emergency", error_words(code), code, error_hint(code))
         while self._heartbeats:
@@ -221,7 +221,7 @@ class Gripper:
                 "mapping", f"TPDO1 has {len(newest)} bytes, {_WORD_AND_POSITION.size} are mapped", len(newest), "reset"
             )
         word, counts = _WORD_AND_POSITION.unpack(newest)
-        self.axis.take_status(word)
+        self.axis.set_status_word(word)
         self._position = self.axis.scale.position(self.axis.counts.update(counts))
         self._status_ns = now_ns
         if self.axis.faulty:

@@ -409,13 +409,13 @@ class _Cycle:
 
 
 class Master:
-    """Cyclic master over a ``codec``. ``fault``: the first one, None while there is none; ``also``: the later ones."""
+    """Cyclic master over a ``codec``. ``fault``: the first one, None without one; ``later_faults``: the later ones."""
 
     def __init__(self, codec: Codec, settings: MasterSettings) -> None:
         self.codec = codec
         self.settings = settings
         self.fault: MasterFault | None = None
-        self.also: list[MasterFault] = []
+        self.later_faults: list[MasterFault] = []
         self.statistics = MasterStatistics()
         joints = settings.joints
         self._n = len(joints)
@@ -479,13 +479,13 @@ class Master:
         self._request = "disable"
 
     def latch(self, fault: MasterFault) -> None:
-        """Latch ``fault``: the first one; later ones are appended to ``also`` (each code and axis once)."""
+        """Latch ``fault``: the first one; later ones are appended to ``later_faults`` (each code and axis once)."""
         if self.fault is None:
             self.fault = fault
             return
-        known = {(f.code, f.axis) for f in (self.fault, *self.also)}
+        known = {(f.code, f.axis) for f in (self.fault, *self.later_faults)}
         if (fault.code, fault.axis) not in known:
-            self.also.append(fault)
+            self.later_faults.append(fault)
 
     def clear(self) -> None:
         """Clear the latched fault and all observations. The axes are off, and remain off until enabled.
@@ -494,14 +494,14 @@ class Master:
         """
         self.codec.faults()  # events of the reset itself: a node that was commanded to boot has booted
         self._restart()
-        self.also = []
+        self.later_faults = []
         self.fault = None
 
     def sample(self) -> JointState | None:
         """The newest complete set, stamped with its poll; None before the first."""
         return self._sample
 
-    def stands(self) -> bool | None:
+    def at_rest(self) -> bool | None:
         """Whether all axes are at rest by the newest complete set; None if that is too old."""
         sample, poll_ns = self._sample, self._cycle.poll_ns
         if sample is None or poll_ns - sample.t_ns > FRESH_CYCLES * self._period_ns:
@@ -705,7 +705,7 @@ class Master:
             if complete and not self.codec.enabled():
                 self.latch(self._states_fault("disabled", None, None, now_ns))
         elif self._mode is Mode.STOPPING:
-            self._rests = self._rests + 1 if complete and self.stands() else 0
+            self._rests = self._rests + 1 if complete and self.at_rest() else 0
             if self._rests >= REST_CYCLES or in_mode_s > self.stop_limit_s:
                 self._enter(Mode.OFF, now_ns)
 

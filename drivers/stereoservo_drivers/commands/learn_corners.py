@@ -29,7 +29,7 @@ from stereoservo_drivers.detectors.landmarks import KINDS, encode_landmarks
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PATIENCE_S = 10.0
 LARGEST_PICTURE = 256 << 20
-Sights = dict[str, list[ImageArray]]
+CameraImages = dict[str, list[ImageArray]]
 
 
 class LearnError(Exception):
@@ -136,7 +136,7 @@ def _text(answer: Mapping[str, Any]) -> list[str]:
 
 def _observations(
     cell: CellFile, path: Path, images: Path | None, pair: tuple[Path, Path] | None, frames: int, ask: bool
-) -> tuple[Sights, Sights | None]:
+) -> tuple[CameraImages, CameraImages | None]:
     """Images before a motion and, for live cameras if ``ask`` is set, after it."""
     if images is not None:
         return _folder(cell, images, frames), None
@@ -156,16 +156,16 @@ def _observations(
     return before, _take_frames(cell, path, frames)
 
 
-def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> Sights:
+def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> CameraImages:
     if len(cell.camera) < 2:
         raise LearnError("argument", f"{option}: the cell file has {len(cell.camera)} camera; two are needed")
     return {camera.name: [_read(file)] for camera, file in zip(cell.camera, files, strict=False)}
 
 
-def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
+def _folder(cell: CellFile, folder: Path, frames: int) -> CameraImages:
     if not folder.is_dir():
         raise LearnError("images", f"{folder} is no folder")
-    views: Sights = {}
+    views: CameraImages = {}
     for camera in cell.camera:
         stills = sorted(
             file
@@ -199,10 +199,10 @@ def _read(file: Path) -> ImageArray:
     return np.asarray(image, dtype=np.uint8)
 
 
-def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
+def _take_frames(cell: CellFile, path: Path, frames: int) -> CameraImages:
     """Frames of the cell's own cameras, through their drivers. Raises DriverError, PluginError."""
     opened: dict[str, CameraDriver] = {}
-    views: Sights = {camera.name: [] for camera in cell.camera}
+    views: CameraImages = {camera.name: [] for camera in cell.camera}
     try:
         for camera in cell.camera:
             context = DriverContext(

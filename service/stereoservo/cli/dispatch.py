@@ -21,7 +21,7 @@ from typer.models import CommandInfo
 
 import stereoservo
 from stereoservo.cli.early_stop import RaisedStop
-from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
+from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, is_known_error, log
 from stereoservo.ports import plugins
 
 
@@ -233,14 +233,14 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
         context = getattr(error, "ctx", None)
         message = error.format_message() if hasattr(error, "format_message") else str(error)
         if context is not None and not as_json:
-            note(context.get_usage())
+            log(context.get_usage())
         fail(CommandError("usage", message), as_json)
         return EXIT_USAGE
     except Exception as error:
         lacking = plugins.missing_extra(error)
         if lacking is not None:
             error = CommandError("missing_extra", lacking)
-        if not known(error):
+        if not is_known_error(error):
             traceback.print_exc()
         fail(error, as_json)
         return EXIT_FAILED

@@ -17,7 +17,7 @@ import typer
 from foxglove.messages import CompressedImage
 from mcap.writer import CompressionType, Writer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.homogeneous import GeometryError
@@ -36,12 +36,14 @@ from stereoservo.recording.foxglove_channels import (
     Published,
     cell_status,
     joints,
-    log,
     markers_seen,
     reasons,
     schema_of,
     set_points_of,
     stamp,
+)
+from stereoservo.recording.foxglove_channels import (
+    log as log_entry,
 )
 from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_span, replay, whole_messages
 from stereoservo.recording.step_layout import decode_step
@@ -130,7 +132,7 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
         rig = load_rig(file)
         cameras, unit = rig.cameras, rig.unit
     if unit != "m":
-        note(f"{file} holds no length in metres: translations are in baselines")
+        log(f"{file} holds no length in metres: translations are in baselines")
     written: list[str] = []
     if opencv is not None:
         exchange.save_opencv(cameras, opencv)
@@ -138,7 +140,7 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
     if ros is not None:
         written += [str(path) for path in exchange.save_ros(cameras, ros)]
         if len(cameras) > 2:
-            note("camera_info has no place for the poses of more than two cameras: they are left out")
+            log("camera_info has no place for the poses of more than two cameras: they are left out")
     if kalibr is not None:
         exchange.save_kalibr(cameras, kalibr)
         written.append(str(kalibr))
@@ -156,7 +158,7 @@ def _export_flight(file: Path, target: Path, json: bool) -> None:
         )
     error = result.replay.max_relative_error
     if error > SAME:
-        note(
+        log(
             f"the replay on this machine or version differs from the recording (largest relative error {error:.2g}): "
             "joints and markers are those recorded, states and errors those of the replay"
         )
@@ -280,7 +282,7 @@ class FlightChannels:
                 self._targets[request.command.goal.id] = request.command.goal.target
         now_ns = inputs.now_ns + self.shift_ns
         for event in outputs.events:
-            yield log(event.t_ns + self.shift_ns, event.kind, event.message, "core")
+            yield log_entry(event.t_ns + self.shift_ns, event.kind, event.message, "core")
         codes = tuple(reason.code for reason in status.reasons)
         if codes != self._codes:
             self._codes = codes

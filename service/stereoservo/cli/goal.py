@@ -25,9 +25,9 @@ from stereoservo.cli.output import (
     CommandError,
     emit,
     goals_beginning,
+    log,
+    log_hold,
     marker_ids,
-    note,
-    note_hold,
     pairs,
     read_file,
 )
@@ -212,7 +212,7 @@ def read_images(cell: str, endpoint: str | None, images: Path, at_s: float, fram
     found = set_points_from_images(path, images, at_s, frames)
     for one in found:
         left_out = ", ".join(str(marker) for marker in one.left_out)
-        note(
+        log(
             f"camera {one.camera}: {len(one.pixels)} markers in {one.frames} frames from {one.at_s:.2f} s on"
             + (f"; markers {left_out} are in fewer than half of them, and left out" if left_out else "")
         )
@@ -468,13 +468,13 @@ def _run(client: Client, requested: Goal, stream: Stream | None, wait: bool, as_
         requested = msgspec.structs.replace(requested, lease_s=WAITING_LEASE_S)
     try:
         handle = client.send(requested)
-        note(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
+        log(f"goal {handle.id} accepted" + (f": {handle.message}" if handle.message != "accepted" else ""))
         if stream is not None:
-            note(f"{handle.stream(stream)} set-points followed")
+            log(f"{handle.stream(stream)} set-points followed")
         if wait:
             follow(handle, as_json, client.cell)
             if requested.acknowledge_s is not None:
-                note(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
+                log(f"it waits there for `stereoservo acknowledge {client.cell} {handle.id}`")
         else:
             emit({"id": handle.id, "accepted": True}, handle.id, as_json)
     except KeyboardInterrupt:
@@ -485,7 +485,7 @@ def _run(client: Client, requested: Goal, stream: Stream | None, wait: bool, as_
 
 def follow(handle: GoalHandle, as_json: bool, cell: str) -> None:
     """Wait for a goal's end and print it; holds are printed, too. Raises CommandError unless it was reached."""
-    result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, cell))
+    result = handle.wait(progress=lambda event: log_hold(event.kind, event.message, cell))
     if result.outcome != "reached":
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))
         raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.why}", goal=tree)

@@ -12,7 +12,7 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.goal import follow
 from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
-from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, emit, note, note_hold
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, emit, log, log_hold
 from stereoservo.client import Client
 from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.wire import FeaturesMessage
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 SPEED = 0.5
 """Share of the joints' velocity limits, as without pictures."""
-FRAMES, LOOK_S, SETTLE_S = 15, 5.0, 0.4
+FRAMES, OBSERVATION_S, SETTLE_S = 15, 5.0, 0.4
 """Number of frames averaged per camera, time limit of an observation [s], and time of rest before it [s]."""
-LOOKS = 6
+MOST_OBSERVATIONS = 6
 PROBE = 0.15
 """Longest motion of a joint [rad or m] before the observations agree on one answer."""
 TELLS_PX = 2.0
@@ -35,7 +35,7 @@ AGREES = 5.0
 """Number of standard deviations within which zeros count as right."""
 
 
-class Look(NamedTuple):
+class Observation(NamedTuple):
     """One observation: joint readings (n,), raw pixels (c, m, 2) of the markers, NaN if unseen, standard deviations (c,
     m) [px].
     """
@@ -77,25 +77,25 @@ def home(
 def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, as_json: bool) -> None:
     if arm.cell.scene.moves:
         raise CommandError("moves", "[scene] moves: the markers move by themselves, and tell no joint's zero")
-    target, looks = _home_of(arm), list[Look]()
-    for _ in range(LOOKS):
-        looks.append(_look(client, arm))
-        found, error_px = _zeros(arm, looks), _from_home_px(arm, looks[-1], target)
-        sure = not found.alternatives and (len(looks) > 1 or _right(found))
-        telling = _telling(arm, looks[-1], found)
+    target, observations = _home_of(arm), list[Observation]()
+    for _ in range(MOST_OBSERVATIONS):
+        observations.append(_observe(client, arm))
+        found, error_px = _zeros(arm, observations), _distance_from_home_px(arm, observations[-1], target)
+        sure = not found.alternatives and (len(observations) > 1 or _right(found))
+        telling = _telling(arm, observations[-1], found)
         if check or (sure and error_px <= _tolerance_px(arm)):
-            _report(arm, looks, found, telling, error_px, check, as_json)
+            _report(arm, observations, found, telling, error_px, check, as_json)
             return
-        way = target - found.offset - looks[-1].readings
+        way = target - found.offset - observations[-1].readings
         if telling is not None:
             way = 0.0 * way
             way[telling.joint] = telling.step
         elif not sure:
             way = way * min(1.0, PROBE / max(float(abs(way).max()), 1e-12))
-        _move(client, arm, looks[-1].readings + way, SPEED * speed_scale)
+        _move(client, arm, observations[-1].readings + way, SPEED * speed_scale)
     raise CommandError(
         "not_reached",
-        f"after {LOOKS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
+        f"after {MOST_OBSERVATIONS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
         f"{1 + len(found.alternatives)} answers are possible: `stereoservo calibrate {client.cell} --check`",
         error_px=error_px,
     )
@@ -111,7 +111,7 @@ def _home_of(arm: LearntArm) -> FloatArray:
     return np.array([stated[name] for name in arm.model.joint_names], dtype=np.float64)
 
 
-def _look(client: Client, arm: LearntArm) -> Look:
+def _observe(client: Client, arm: LearntArm) -> Observation:
     """The markers' mean pixels, with the arm at rest. Raises CommandError if the body is not seen."""
     import numpy as np
 
@@ -123,7 +123,7 @@ def _look(client: Client, arm: LearntArm) -> Look:
     frames = dict.fromkeys(cameras, 0)
     time.sleep(SETTLE_S)
     before = client.joints()
-    until = time.monotonic() + LOOK_S
+    until = time.monotonic() + OBSERVATION_S
     for message in client.watch(features=True):
         interruption.check()
         if isinstance(message, FeaturesMessage) and message.camera in frames:
@@ -152,10 +152,10 @@ def _look(client: Client, arm: LearntArm) -> Look:
     often = np.maximum(count, 1.0)
     sigmas = np.hypot(np.sqrt(variance) / often, own)
     pixels = np.where(seen[..., None], total / often[..., None], np.nan)
-    return Look(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
+    return Observation(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
 
 
-def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
+def _zeros(arm: LearntArm, observations: list[Observation]) -> JointZeros:
     """Corrections of the joint readings, from all observations. Raises CommandError if the pictures do not determine
     them, or if the resulting posture is beyond the cell's limits.
     """
@@ -164,8 +164,8 @@ def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
     from stereoservo.kinematics.joint_angles import joint_zeros
     from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
 
-    pixels, sigmas = np.array([look.pixels for look in looks]), np.array([look.sigmas for look in looks])
-    readings = np.array([look.readings for look in looks])
+    pixels, sigmas = np.array([look.pixels for look in observations]), np.array([look.sigmas for look in observations])
+    readings = np.array([look.readings for look in observations])
     check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
     try:
         found = joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
@@ -199,7 +199,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     ]
 
 
-def _telling(arm: LearntArm, look: Look, found: JointZeros) -> TellingMotion | None:
+def _telling(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMotion | None:
     """Motion that distinguishes the possible postures of an observation; None if one remains, or no motion does."""
     import numpy as np
 
@@ -223,7 +223,7 @@ def _tolerance_px(arm: LearntArm) -> float:
     return max(arm.cell.servo.tolerance_px, 3.0 * own)
 
 
-def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
+def _distance_from_home_px(arm: LearntArm, look: Observation, target: FloatArray) -> float:
     """Largest distance [px] of a marker from its position predicted by the model for the home posture."""
     import numpy as np
 
@@ -236,14 +236,14 @@ def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
 def _move(client: Client, arm: LearntArm, readings: FloatArray, speed_scale: float) -> None:
     positions = dict(zip(arm.model.joint_names, readings.tolist(), strict=True))
     with client.goal(JointTarget(positions), speed_scale=speed_scale) as handle:
-        result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, client.cell))
+        result = handle.wait(progress=lambda event: log_hold(event.kind, event.message, client.cell))
     if result.outcome != "reached":
         raise CommandError(f"goal_{result.outcome}", f"the way home ended: {result.outcome}: {result.why}")
 
 
 def _report(
     arm: LearntArm,
-    looks: list[Look],
+    observations: list[Observation],
     found: JointZeros,
     telling: TellingMotion | None,
     error_px: float,
@@ -251,7 +251,7 @@ def _report(
     as_json: bool,
 ) -> None:
     name, model = arm.cell.cell.name, arm.model
-    readings, decided = looks[-1].readings, not found.alternatives
+    readings, decided = observations[-1].readings, not found.alternatives
     rows: list[dict[str, Any]] = [
         {
             "joint": joint,
@@ -265,12 +265,12 @@ def _report(
     postures = [(readings + offset).tolist() for offset in (found.offset, *found.alternatives)]
     lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _right(found))
     state = "not moved" if check else "home"
-    lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(looks)} looks")
+    lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(observations)} looks")
     if decided and not _right(found):
-        note(
+        log(
             f"one look may show a body, base or cameras that moved as zeros that are off: `stereoservo home {name} "
             "--by-vision` looks again from elsewhere"
-            if len(looks) == 1
+            if len(observations) == 1
             else f"set the encoders' zeros, or move those of the model: `stereoservo calibrate {name} --check "
             "--reset-zeros`"
         )
@@ -280,7 +280,7 @@ def _report(
             "decided": decided,
             "error_px": error_px,
             "joints": rows,
-            "looks": len(looks),
+            "looks": len(observations),
             "alternatives": len(found.alternatives),
             "postures": [dict(zip(model.joint_names, posture, strict=True)) for posture in postures],
             "told_by": None

@@ -106,24 +106,24 @@ def coloured(text: str, colour: str, stream: TextIO) -> str:
     return typer.style(text, fg=colour, bold=True) if stream.isatty() and not os.environ.get("NO_COLOR") else text
 
 
-def note(message: str) -> None:
+def log(message: str) -> None:
     """Print progress and remarks on stderr; if that fails because of a full disk, only they are lost."""
     with suppress(OSError):
         print(message, file=sys.stderr, flush=True)
 
 
-def note_hold(kind: str, message: str, cell: str) -> None:
+def log_hold(kind: str, message: str, cell: str) -> None:
     """Print that a motion which is waited for was held or resumed, and how to continue; nothing for other events."""
     if kind == "held":
-        note(f"{message}: nothing moves until `stereoservo resume {cell}`")
+        log(f"{message}: nothing moves until `stereoservo resume {cell}`")
     elif kind == "resumed":
-        note(message)
+        log(message)
 
 
 def fail(error: BaseException, as_json: bool) -> None:
     """Print a failure: the message on stderr, and ``{"error": …}`` on stdout with ``--json``."""
     message = str(error) or type(error).__name__
-    note(f"{coloured('error:', 'red', sys.stderr)} {message}")
+    log(f"{coloured('error:', 'red', sys.stderr)} {message}")
     if as_json:
         body: dict[str, Any] = {"code": code_of(error), "message": message}
         reply = getattr(error, "reply", None)
@@ -141,7 +141,7 @@ def code_of(error: BaseException) -> str:
     return given if isinstance(given, str) and given else _snake(type(error).__name__)
 
 
-def known(error: BaseException) -> bool:
+def is_known_error(error: BaseException) -> bool:
     """Whether an exception is raised by this project on purpose, so that its text suffices without a traceback."""
     return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, note
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, log
 from stereoservo.client import EventWatch, HeardEvents
 from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.wire import EventMessage
@@ -32,7 +32,7 @@ def record(
 
     def hear(event: EventMessage) -> None:
         if event.kind in ("images_ended", "recording_failed"):
-            note(event.message)
+            log(event.message)
 
     recorded: ImagesRecorded | None = None
     with options.client(cell) as client, EventWatch(client) as watch:
@@ -45,14 +45,14 @@ def record(
                 client.record(on=False)
                 raise CommandError("recording_failed", began.message)
             file = began.message
-        note(f"recording into {file}; Ctrl-C ends it")
+        log(f"recording into {file}; Ctrl-C ends it")
         until = time.monotonic() + seconds
         try:
             while time.monotonic() < until:
                 time.sleep(min(0.5, max(0.0, until - time.monotonic())))
                 heard.poll()
         except KeyboardInterrupt:
-            note("ending the recording")
+            log("ending the recording")
         finally:
             reply = client.record(on=False)
         if images:

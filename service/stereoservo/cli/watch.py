@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, log
 from stereoservo.cli.status import progress_words
 from stereoservo.client import Client
 from stereoservo.messages.reasons import Reason
@@ -79,7 +79,7 @@ def _viewers(
         from stereoservo.cli.foxglove_server import FoxgloveServer  # of the extra `cell`: only for this
 
         server = opened.enter_context(FoxgloveServer(cell, port))
-        note(f"in Foxglove: Open connection, ws://localhost:{server.port}")
+        log(f"in Foxglove: Open connection, ws://localhost:{server.port}")
         found.append(server)
     if rerun:
         from stereoservo.cli.rerun_viewer import RerunViewer  # of the extra `watch`: only for this

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stereoservo.cli import interruption
-from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, log
 from stereoservo.messages.keys import InvalidKeyError, check_name
 
 if TYPE_CHECKING:
@@ -80,13 +80,13 @@ def web(
         make_link = partial(FlightLink, flight)
     else:
         assert cell is not None
-        make_link = partial(CellLink, cell, endpoint, operate or "page", log=note)
+        make_link = partial(CellLink, cell, endpoint, operate or "page", log=log)
     tokens: list[str] = []
 
     def announce(token: str) -> None:
         tokens.append(token)
         if len(tokens) > 1 or not json:
-            note(f"token to command the arm as {operate}, good for one use: {token}")
+            log(f"token to command the arm as {operate}, good for one use: {token}")
 
     interruption.check()  # an interrupt that was lost while packages were imported
     with interruption.ending(END_S) as ending:
@@ -94,7 +94,7 @@ def web(
         asyncio.run(_serve(server, address, port, context, host or [], tokens, json, ending))
         left = interruption.threads_left(THREADS_S)
         if left:
-            note(f"ended without waiting for what does not answer: {', '.join(left)}")
+            log(f"ended without waiting for what does not answer: {', '.join(left)}")
             interruption.leave(0)
 
 
@@ -140,7 +140,7 @@ async def _serve(
         emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
         if not ending.asked:
             await ended.wait()
-        note(
+        log(
             f"ending: pages are closed, and what they have started stops; by force after {END_S:g} s, or at once by a "
             "second Ctrl-C"
         )

@@ -225,7 +225,7 @@ class ServiceBench:
                     raise
                 time.sleep(0.1)
 
-    def asked_ready(self, ask: Callable[[Client], T]) -> T:
+    def query_ready_cell(self, ask: Callable[[Client], T]) -> T:
         """The answer of a cell that is made ready first, again if a stalled machine stopped it since."""
 
         def operated(client: Client) -> T:
@@ -235,7 +235,7 @@ class ServiceBench:
         self.ready()
         return self.asked(operated)
 
-    def forget_state(self) -> None:
+    def delete_state(self) -> None:
         """Remove the models and taught goals of a trial, and the disk they are on."""
         self.mounts.close()
         for path in (*self.directories.models.glob("*"), *self.directories.state.glob("taught.json*")):

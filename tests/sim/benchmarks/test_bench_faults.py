@@ -158,7 +158,7 @@ def test_where_nothing_may_be_mounted_the_trials_are_void_with_the_reason(tmp_pa
     with ExitStack() as mounts:
         bench = SimpleNamespace(
             folder=tmp_path, directories=SimpleNamespace(state=tmp_path / "s"), mounts=mounts, lasting=ExitStack(),
-            goals=[], end_daemon=lambda: None, forget_state=lambda: None,
+            goals=[], end_daemon=lambda: None, delete_state=lambda: None,
         )  # fmt: skip
         row = service._row(bench, next(fault for fault in service.FAULTS if fault.disk is disk), 3)
     assert (row["trials"], row["within"], row["rest_ms"]) == (0, 0, None)

@@ -24,8 +24,8 @@ from stereoservo.cli.output import (
     CommandError,
     cells_beginning,
     emit,
-    note,
-    note_hold,
+    log,
+    log_hold,
 )
 from stereoservo.client import Client, FailedError
 from stereoservo.messages.check_report import CheckReport, ZeroReset
@@ -194,7 +194,7 @@ def _calibrate_live(given: CalibrateOptions, options: CellOptions) -> None:
             try:
                 find_daemon(given.cell)
             except NotRunningError:
-                note("no daemon runs for this cell: starting one, and switching the drives on")
+                log("no daemon runs for this cell: starting one, and switching the drives on")
                 enable = True
                 stack.enter_context(DaemonProcess(Path(given.cell))).wait_ready()
         client = stack.enter_context(options.client(given.cell, interruption.check))
@@ -294,7 +294,7 @@ def _lines(what: str) -> Callable[[float, str], None]:
         nonlocal said
         if int(10 * done) > said:
             said = int(10 * done)
-            note(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
+            log(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
 
     return tell
 
@@ -303,9 +303,9 @@ def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMe
     """Event handler that passes progress, 0 to 1 with its message, to ``tell``, and prints warnings and holds."""
 
     def progress(event: EventMessage) -> None:
-        note_hold(event.kind, event.message, cell)
+        log_hold(event.kind, event.message, cell)
         if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
-            note(event.message)
+            log(event.message)
         if event.progress is None:
             return
         fitting = event.kind.startswith("fit")

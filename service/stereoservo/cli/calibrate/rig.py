@@ -27,7 +27,7 @@ from stereoservo.calibration.camera_rig.views import RigViews, still_places
 from stereoservo.calibration.trial_data import TrialCamera
 from stereoservo.cli.calibrate.command import CalibrateOptions
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
-from stereoservo.cli.output import CommandError, note, shipped_or_path
+from stereoservo.cli.output import CommandError, log, shipped_or_path
 from stereoservo.daemon.camera_setup import recorded_camera, video_of
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.messages.cell_file import load_cell_file
@@ -178,7 +178,7 @@ def _folders(options: CalibrateOptions, board: tuple[int, int] | None) -> RigVie
             found[key] = detector.detect(Frame(name, len(found), 0, 0, image), None)
         assert size is not None
         shown = sum(o.ids.size > 0 for o in found.values())
-        note(f"camera {name}: the body in {shown} of {len(files)} pictures")
+        log(f"camera {name}: the body in {shown} of {len(files)} pictures")
         if board is not None and not shown:
             raise CommandError(
                 "images",
@@ -242,8 +242,8 @@ def _recorded(options: CalibrateOptions) -> RigViews:
     for section in cell.camera:
         one = recorded_camera(cell, path, section.name, video_of(options.images, section.name))
         cameras.append(TrialCamera(section.name, one.description.width, one.description.height))
-        seen[section.name] = list(one.observations(note))
-        note(f"camera {section.name}: {len(seen[section.name])} frames")
+        seen[section.name] = list(one.observations(log))
+        log(f"camera {section.name}: {len(seen[section.name])} frames")
     return still_places(cameras, seen)
 
 
@@ -262,7 +262,7 @@ def _live(options: CalibrateOptions) -> RigViews:
             "daemon_runs", f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording"
         )
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("rig"))
-    note(
+    log(
         f"watching for {options.seconds:g} s: hold the body still for half a second, here and there, also tilted, near "
         "and far, in the pictures' corners"
     )
@@ -280,7 +280,7 @@ def _live(options: CalibrateOptions) -> RigViews:
         raise CommandError("cameras", "; ".join(failed))
     cameras = [TrialCamera(r.description.name, r.description.width, r.description.height) for r in records]
     views = still_places(cameras, {r.description.name: r.seen for r in records})
-    note(f"{len(views.names)} places in {time.monotonic() - began:.0f} s")
+    log(f"{len(views.names)} places in {time.monotonic() - began:.0f} s")
     return views
 
 

@@ -29,7 +29,7 @@ from stereoservo.cli.doctor.command import examine_file, examine_pictures, line_
 from stereoservo.cli.doctor.joints import examine_joints
 from stereoservo.cli.doctor.plate_motion import judge_turn, turn_between
 from stereoservo.cli.init import cell_text, toml_lines, toml_options
-from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.cli.setup.dialogue import Dialogue, answers_text, read_answers
 from stereoservo.client import Client, ClientError
 from stereoservo.daemon.camera_setup import make_camera
@@ -862,7 +862,7 @@ def _plates(file: Path, dialogue: Dialogue) -> None:
             force=True, as_json=False,
         )  # fmt: skip
     if not plate.exists():
-        note(told.getvalue())
+        log(told.getvalue())
         raise CommandError("file", f"{plate} could not be written")
     dialogue.say(
         f"   {plate}: print it at 100 %, measure the bar, fold it, glue it to something stiff, fix that to the hand.\n"

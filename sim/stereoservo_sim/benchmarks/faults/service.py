@@ -379,7 +379,7 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
                 bench.end_daemon()
                 anew = True
             if fault.note or (fault.disk is not None and anew):
-                bench.forget_state()
+                bench.delete_state()
             took_s.append(time.monotonic() - began_s)
         if trial["stall_s"] > STALL_S:
             void.append(f"the machine stalled for {trial['stall_s'] * 1e3:.0f} ms")
@@ -387,7 +387,7 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
             trials.append(trial)
     if fault.trials_a_daemon or fault.disk is not None:
         bench.end_daemon()
-        bench.forget_state()
+        bench.delete_state()
     rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
     bound = None if fault.bound_ms is None else fault.bound_ms + RAMP_MS
     return {

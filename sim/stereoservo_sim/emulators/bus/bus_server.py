@@ -236,7 +236,7 @@ class BusServer:
             request.done.set()
 
     def _pass_events(self) -> None:
-        news = self.emulator.take_news()
+        news = self.emulator.take_events()
         if self.on_event is not None:
             for event in news:
                 self.on_event(event)

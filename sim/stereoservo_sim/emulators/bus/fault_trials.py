@@ -316,7 +316,7 @@ def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
     t0 = rig.host.t_ns
     rig.order(case.orders)
     rig.host.velocities = speed
-    _strike(rig)
+    _inject_host_fault(rig)
     if case.by == "nobody":
         return _tolerated(rig, speed)
     rest_ns = _until_rest(rig, t0)
@@ -334,7 +334,7 @@ def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
     )
 
 
-def _strike(rig: FaultRig) -> None:
+def _inject_host_fault(rig: FaultRig) -> None:
     """Inject the fault of the master's host."""
     if rig.case.host in ("killed", "cycle_hangs"):
         rig.host.cycling = False
@@ -586,14 +586,14 @@ def trial_rng(case: FaultCase, protocol: str, seed: int, trial: int) -> np.rando
 
 def run_row(case: FaultCase, protocol: str, trials: int, seed: int, *, run_on_s: float = 1.0) -> FaultRow:
     """Run ``trials`` trials. Raises TrialError."""
-    return sum_up(
+    return summarize(
         case,
         protocol,
         [run_trial(case, protocol, trial_rng(case, protocol, seed, k), run_on_s=run_on_s) for k in range(trials)],
     )
 
 
-def sum_up(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
+def summarize(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
     """Row of a fault's trials. If only the drives detect a fault, a later latch of the master is no detection."""
     seen = [] if case.host in ("killed", "cycle_hangs") else [trial.detected_ms for trial in trials]
     detected_median, detected_max = _median_and_max(seen)

@@ -61,7 +61,7 @@ class CameraEmulator:
         self.refused: set[str] = set()
         self.wanted: set[str] = {camera.stream for camera in cameras}
         """Streams with a client; no images are made for others."""
-        self.on_hang_up: Callable[[str, bool], None] = lambda stream, within: None
+        self.on_close_connections: Callable[[str, bool], None] = lambda stream, within: None
         """Called to close a stream's connections, at once or within the next image."""
         self._camera_lock = threading.Lock()
         self._heap_lock = threading.Lock()
@@ -70,7 +70,7 @@ class CameraEmulator:
         self.faults = FaultEngine(
             LANGUAGE, self, start_ns, check=self._check_names, log=self._log_fault, guard=self._camera_lock
         )
-        self._news: deque[CameraEvent] = deque(maxlen=EVENTS_KEPT)
+        self._new_events: deque[CameraEvent] = deque(maxlen=EVENTS_KEPT)
         self._count = 0
 
     def open(self) -> None:
@@ -139,15 +139,15 @@ class CameraEmulator:
     def _log_fault(self, t_ns: int, kind: str, command: CameraCommand, text: str) -> None:
         self.tell(t_ns, kind, command.camera, text)
 
-    def take_news(self) -> list[CameraEvent]:
+    def take_events(self) -> list[CameraEvent]:
         """Events since the last call."""
-        news = list(self._news)
-        self._news.clear()
-        return news
+        events = list(self._new_events)
+        self._new_events.clear()
+        return events
 
     def tell(self, t_ns: int, kind: str, camera: str, text: str = "") -> None:
         """Add an event."""
-        self._news.append(CameraEvent(t_ns, kind, camera, text))
+        self._new_events.append(CameraEvent(t_ns, kind, camera, text))
 
     def status(self) -> list[str]:
         """Status, one line a camera."""
@@ -182,9 +182,9 @@ class CameraEmulator:
         other = next(c for c in self.cameras if self._streams[c.name] == camera.stream)
         self.swap(camera, other)
 
-    def hang_up(self, stream: str, *, within: bool = False) -> None:
+    def close_connections(self, stream: str, *, within: bool = False) -> None:
         """Close the connections of a stream, at once or ``within`` the next image."""
-        self.on_hang_up(stream, within)
+        self.on_close_connections(stream, within)
 
 
 # -- fault commands ------------------------------------------------------------------------------------------
@@ -333,20 +333,20 @@ def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComm
 
 @_each
 def _disconnect(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    emulator.hang_up(camera.stream)
+    emulator.close_connections(camera.stream)
     return "connections closed"
 
 
 @_each
 def _cut(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    emulator.hang_up(camera.stream, within=True)
+    emulator.close_connections(camera.stream, within=True)
     return "connections end in the middle of the next picture"
 
 
 @_each
 def _refuse(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     emulator.refused.add(camera.stream)
-    emulator.hang_up(camera.stream)
+    emulator.close_connections(camera.stream)
     return "connections refused", lambda: emulator.refused.discard(camera.stream)
 
 

@@ -223,7 +223,7 @@ class Cia402Node:
 
     # -- the bus -------------------------------------------------------------------------------------------------
 
-    def hears(self, frame: CanFrame) -> bool:
+    def accepts(self, frame: CanFrame) -> bool:
         """See ``EmulatedNode``."""
         can_id = frame.id
         return (
