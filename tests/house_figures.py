@@ -535,15 +535,20 @@ def circle_figure() -> Figure:
 
 
 def importer_figures() -> list[Figure]:
-    """Modules that exactly one other module imports, wherever in it, and those in its folder. What pyproject.toml names
-    as an entry point has an importer more; packages are no modules of their own.
+    """Modules that exactly one other module imports, wherever in it, and those in its folder. What pyproject.toml, or a
+    table of commands or benches, names as ``module:function`` is loaded on its own, and has an importer more; packages
+    are no modules of their own.
     """
     paths = {_dotted(path): path for path in modules()}
     importers: dict[str, set[str]] = defaultdict(set)
     for name, path in paths.items():
-        for imported in _imported_by(ast.walk(ast.parse(path.read_text())), set(paths)) - {name}:
+        tree = ast.parse(path.read_text())
+        for imported in _imported_by(ast.walk(tree), set(paths)) - {name}:
             importers[imported].add(name)
-    for group in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"].values():
+        for imported in _named_in(tree, name, set(paths)) - {name}:
+            importers[imported].add(f"table of {name}")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    for group in (project["scripts"], *project["entry-points"].values()):
         for entry in group.values():
             importers[entry.partition(":")[0]].add("pyproject.toml")
     single = {
@@ -581,6 +586,13 @@ def _imported_by(nodes: Iterable[ast.AST], known: set[str]) -> set[str]:
                 inner = f"{node.module}.{alias.name}"
                 found.add(inner if inner in known else node.module)
     return found & known
+
+
+def _named_in(tree: ast.AST, module: str, known: set[str]) -> set[str]:
+    """Modules that a module names as ``module:function``, from the top or below its own package."""
+    texts = [node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    named = [match[1] for match in map(re.compile(r"([\w.]+):\w+").fullmatch, texts) if match]
+    return known & {*named, *(f"{module.rpartition('.')[0]}.{name}" for name in named)}
 
 
 def _module_level(body: list[ast.stmt]) -> Iterator[ast.stmt]:

@@ -27,10 +27,9 @@ from stereoservo_drivers.episodes import episode_of, refused
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decode_video_options, frozen_frames
-from stereoservo_drivers.video.pictures import PICTURE_FLAG, check_size, jpeg_size, one_channel
+from stereoservo_drivers.video.pictures import PICTURE_FLAG, Watch, check_size, jpeg_size, one_channel
 from stereoservo_drivers.video.server_clock import ServerClock
 from stereoservo_drivers.video.sources import CaptureSource, GenicamSource, LiveSource, Settings, SourcePicture
-from stereoservo_drivers.video.stream_monitor import Watch
 
 MOST_A_POLL = 8
 """Largest number of frames that a late poll skips: bounds its time."""

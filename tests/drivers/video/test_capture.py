@@ -20,8 +20,8 @@ from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video import sources
 from stereoservo_drivers.video.driver import Reader
 from stereoservo_drivers.video.options import Place, VideoOptions
+from stereoservo_drivers.video.pictures import Watch
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
-from stereoservo_drivers.video.stream_monitor import Watch
 
 from .conftest import HEIGHT, WIDTH, number_of, picture, poll_until
 

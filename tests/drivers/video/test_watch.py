@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo_drivers.video.stream_monitor import Watch
+from stereoservo_drivers.video.pictures import Watch
 
 MS = 1_000_000
 

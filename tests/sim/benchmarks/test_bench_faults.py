@@ -1,4 +1,4 @@
-"""`stereoservo bench faults`: its rows and tables. The faults themselves are tested in drives/test_fault_table.py."""
+"""`stereoservo bench faults`: its rows and tables. The faults are tested in emulators/bus/test_fault_table.py."""
 
 from __future__ import annotations
 

@@ -647,7 +647,7 @@ class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     """Options of a cell file: which arm is simulated, and its layout. Without ``urdf``: the embedded arm.
 
     ``urdf``: a file, relative to the cell file, shipped here, or of pybullet_data.
-    ``flange``: the link that carries the body (default: see `urdf_file.load_urdf`).
+    ``flange``: the link that carries the body (default: see `load_urdf`).
     ``mounted``: pose of the arm's root in the world.
     ``carried``: displacement of the marker body on the flange (of the rig, if the cameras are on the arm) from its
     default pose, which looks along the flange's z from in front of the parts there.
