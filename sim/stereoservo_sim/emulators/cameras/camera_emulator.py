@@ -325,6 +325,26 @@ def _setter(answer: str, **marks: object) -> Callable[[CameraEmulator, CameraCom
     return _each(lambda emulator, camera, command: _set(camera, answer, **marks))
 
 
+def _by_command(
+    answer: Callable[[CameraCommand], str], **marks: Callable[[CameraCommand], object]
+) -> Callable[[CameraEmulator, CameraCommand], Answer]:
+    """Factory of actions that set fields of the condition to values of the command."""
+    return _each(
+        lambda emulator, camera, command: _set(
+            camera, answer(command), **{name: value(command) for name, value in marks.items()}
+        )
+    )
+
+
+_latency = _by_command(lambda c: f"latency {c.time_ns * 1e-6:g} ms", latency_ns=lambda c: c.time_ns)
+_jitter = _by_command(lambda c: f"jitter {c.time_ns * 1e-6:g} ms", jitter_ns=lambda c: c.time_ns)
+_exposure = _by_command(lambda c: f"exposure {c.number:g}", gain=lambda c: c.number)
+_lamp = _by_command(lambda c: f"lamp {c.what}", lamp=lambda c: c.what == "on")
+_resize = _by_command(lambda c: f"{c.size[0]}x{c.size[1]}", size=lambda c: c.size)
+_truncate = _by_command(lambda c: f"{c.number:g} JPEGs end in the middle", truncate=lambda c: int(c.number))
+_corrupt = _by_command(lambda c: f"{c.number:g} JPEGs spoilt", corrupt=lambda c: int(c.number))
+
+
 @_each
 def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     emulator.stalled.add(camera.stream)
@@ -351,16 +371,6 @@ def _refuse(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCom
 
 
 @_each
-def _latency(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"latency {command.time_ns * 1e-6:g} ms", latency_ns=command.time_ns)
-
-
-@_each
-def _jitter(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"jitter {command.time_ns * 1e-6:g} ms", jitter_ns=command.time_ns)
-
-
-@_each
 def _skew(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     before = camera.view.phase_s
     camera.view.change(phase_s=command.time_ns * 1e-9)
@@ -374,35 +384,10 @@ def _loss(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComma
     return f"loses {command.number:.0%} of its pictures", lambda: camera.view.change(drop_rate=before)
 
 
-@_each
-def _exposure(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"exposure {command.number:g}", gain=command.number)
-
-
-@_each
-def _lamp(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"lamp {command.what}", lamp=command.what == "on")
-
-
-@_each
-def _resize(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.size[0]}x{command.size[1]}", size=command.size)
-
-
 def _swap(emulator: CameraEmulator, command: CameraCommand) -> Answer:
     first, second = emulator.named(command.camera)[0], emulator.named(command.what)[0]
     emulator.swap(first, second)
     return f"{first.name} and {second.name}: swapped", lambda: emulator.swap(first, second)
-
-
-@_each
-def _truncate(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.number:g} JPEGs end in the middle", truncate=int(command.number))
-
-
-@_each
-def _corrupt(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.number:g} JPEGs spoilt", corrupt=int(command.number))
 
 
 @_each
