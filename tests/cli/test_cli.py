@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 
+import stereoservo
 from stereoservo.cli import dispatch, output
 from stereoservo.cli import main as cli
 from stereoservo.cli.warmup import _wait
@@ -49,6 +50,12 @@ def cell(tmp_path: Path, run: Run) -> Path:
     path = tmp_path / "cell.toml"
     assert run("init", str(path))[0] == 0
     return path
+
+
+def test_the_package_is_the_command_line() -> None:
+    command = [sys.executable, "-m", "stereoservo.cli", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+    assert done.stdout == f"stereoservo {stereoservo.__version__}\n"
 
 
 @pytest.mark.parametrize("command", list(dispatch.OWN))

@@ -245,6 +245,8 @@ Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
 """The process that waits for a goal renews its lease: when it dies, the arm stops."""
 
+TARGETS = ("file", "name", "joint", "set_points", "points", "displacement", "incidence")
+"""Options that are a target, without those of streams and images."""
 FOR_POSTURES = ("taught", "features")
 """Kinds of targets whose postures are listed."""
 
@@ -381,10 +383,7 @@ def goal(cell: CellArgument, given: GoalOptions = GOAL_OPTIONS, options: CellOpt
     stream: Stream | None = None
     found: tuple[SetPoints, ...] = ()
     target: dict[str, Any] = {}
-    others = bool(
-        given.file or given.name or given.joint or given.set_points or given.points or given.displacement
-        or given.incidence
-    )  # fmt: skip
+    others = any(getattr(given, option) for option in TARGETS)
     if given.follow_file is not None:
         if others or given.images:
             raise CommandError("usage", "--follow is a target of its own; its first line is where it begins")
@@ -396,10 +395,8 @@ def goal(cell: CellArgument, given: GoalOptions = GOAL_OPTIONS, options: CellOpt
         target = feature_tree(found)
     elif given.file is None:
         files = {"points": given.points, "displacement": given.displacement, "incidence": given.incidence}
-        target = target_tree(
-            given.name, given.joint, given.set_points, files, given.relative_to, given.common, given.lines,
-            given.planes,
-        )  # fmt: skip
+        relative = (given.relative_to, given.common, given.lines, given.planes)
+        target = target_tree(given.name, given.joint, given.set_points, files, *relative)
     local = target if given.file is None and stream is None and options.endpoint is None else {}
     ends_in = None if given.posture is None else _ends_in(cell, local, given.posture, options.operator)
     requested = _requested(given, target, ends_in) if given.file is None else decode(read_file(given.file), Goal)
