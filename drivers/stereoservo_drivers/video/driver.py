@@ -27,7 +27,7 @@ from stereoservo_drivers.episodes import episode_of, refused
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decode_video_options, frozen_frames
-from stereoservo_drivers.video.pictures import PICTURE_FLAG, Watch, check_size, jpeg_size, one_channel
+from stereoservo_drivers.video.pictures import PICTURE_FLAG, StreamMonitor, check_size, jpeg_size, one_channel
 from stereoservo_drivers.video.server_clock import ServerClock
 from stereoservo_drivers.video.sources import CaptureSource, GenicamSource, LiveSource, Settings, SourcePicture
 
@@ -41,7 +41,7 @@ class Playback:
     With pace ``every`` each poll returns the next frame with the recording's own stamps, at any time.
     """
 
-    def __init__(self, place: Place, options: VideoOptions, camera: str, watch: Watch, clock: Clock) -> None:
+    def __init__(self, place: Place, options: VideoOptions, camera: str, watch: StreamMonitor, clock: Clock) -> None:
         self.settings: Settings = {}
         self._place = place
         self._options = options
@@ -471,7 +471,7 @@ class VideoCameraDriver:
         self._context = context
         self._check_arm()
         self._life = DriverLifecycle(f"camera driver {DRIVER!r} ({context.camera})")
-        self._watch = Watch(self._options.rate_hz)
+        self._watch = StreamMonitor(self._options.rate_hz)
         limit_s = self._options.server_clock_s
         self._server_clock = None if limit_s is None else ServerClock(limit_s)
         self._feed: Feed | None = None
@@ -767,7 +767,9 @@ def live_source(
 class Reader:
     """Reads ``source``, which must be unused, in a separate thread. Every wait of its callers is bounded."""
 
-    def __init__(self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: Watch) -> None:
+    def __init__(
+        self, source: LiveSource, place: Place, options: VideoOptions, camera: str, watch: StreamMonitor
+    ) -> None:
         self.abandoned = False
         self._source = source
         self._place = place

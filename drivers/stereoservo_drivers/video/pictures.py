@@ -83,7 +83,7 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int] | None:
 # -- monitor of a stream ---------------------------------------------------------------------------------------
 
 
-class Watch:
+class StreamMonitor:
     """Numbers the frames of one camera, counts missing ones, withholds repeated images. Persists over reconnections.
 
     ``row``: number of consecutive pictures equal to the last one delivered.

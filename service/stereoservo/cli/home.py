@@ -28,10 +28,10 @@ FRAMES, OBSERVATION_S, SETTLE_S = 15, 5.0, 0.4
 MOST_OBSERVATIONS = 6
 PROBE = 0.15
 """Longest motion of a joint [rad or m] before the observations agree on one answer."""
-TELLS_PX = 2.0
+LEAST_DIFFERENCE_PX = 2.0
 """Least difference [px] between the pictures of two postures for a motion to be made, in addition to the model's own.
 """
-AGREES = 5.0
+AGREEMENT_SIGMA = 5.0
 """Number of standard deviations within which zeros count as right."""
 
 
@@ -77,22 +77,22 @@ def home(
 def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, as_json: bool) -> None:
     if arm.cell.scene.moves:
         raise CommandError("moves", "[scene] moves: the markers move by themselves, and tell no joint's zero")
-    target, observations = _home_of(arm), list[Observation]()
+    target, observations = _home_position(arm), list[Observation]()
     for _ in range(MOST_OBSERVATIONS):
         observations.append(_observe(client, arm))
-        found, error_px = _zeros(arm, observations), _distance_from_home_px(arm, observations[-1], target)
-        sure = not found.alternatives and (len(observations) > 1 or _right(found))
-        telling = _telling(arm, observations[-1], found)
+        found, error_px = _estimate_zeros(arm, observations), _distance_from_home_px(arm, observations[-1], target)
+        sure = not found.alternatives and (len(observations) > 1 or _zeros_hold(found))
+        telling = _informative_motion(arm, observations[-1], found)
         if check or (sure and error_px <= _tolerance_px(arm)):
             _report(arm, observations, found, telling, error_px, check, as_json)
             return
-        way = target - found.offset - observations[-1].readings
+        displacement = target - found.offset - observations[-1].readings
         if telling is not None:
-            way = 0.0 * way
-            way[telling.joint] = telling.step
+            displacement = 0.0 * displacement
+            displacement[telling.joint] = telling.step
         elif not sure:
-            way = way * min(1.0, PROBE / max(float(abs(way).max()), 1e-12))
-        _move(client, arm, observations[-1].readings + way, SPEED * speed_scale)
+            displacement = displacement * min(1.0, PROBE / max(float(abs(displacement).max()), 1e-12))
+        _move(client, arm, observations[-1].readings + displacement, SPEED * speed_scale)
     raise CommandError(
         "not_reached",
         f"after {MOST_OBSERVATIONS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
@@ -101,7 +101,7 @@ def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, 
     )
 
 
-def _home_of(arm: LearntArm) -> FloatArray:
+def _home_position(arm: LearntArm) -> FloatArray:
     """The home position (n,): the cell file's, or the base from which the model was learnt."""
     import numpy as np
 
@@ -155,7 +155,7 @@ def _observe(client: Client, arm: LearntArm) -> Observation:
     return Observation(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
 
 
-def _zeros(arm: LearntArm, observations: list[Observation]) -> JointZeros:
+def _estimate_zeros(arm: LearntArm, observations: list[Observation]) -> JointZeros:
     """Corrections of the joint readings, from all observations. Raises CommandError if the pictures do not determine
     them, or if the resulting posture is beyond the cell's limits.
     """
@@ -173,7 +173,7 @@ def _zeros(arm: LearntArm, observations: list[Observation]) -> JointZeros:
         other = f"; zeros alone do not explain them: {check} looks for other causes"
         told = f"the pictures do not tell the joints' zeros: {error}"
         raise CommandError(error.code, told + (other if error.code == "no_agreement" else "")) from error
-    beyond = [] if found.alternatives or _right(found) else _beyond_limits(arm, readings[-1], found)
+    beyond = [] if found.alternatives or _zeros_hold(found) else _beyond_limits(arm, readings[-1], found)
     if beyond:
         raise CommandError(
             "outside_limits",
@@ -188,7 +188,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     import numpy as np
 
     at = readings + found.offset
-    slack = arm.cell.safety.position_margin + AGREES * found.deviations
+    slack = arm.cell.safety.position_margin + AGREEMENT_SIGMA * found.deviations
     low, high = arm.limits[:, 0] - slack, arm.limits[:, 1] + slack
     turns = np.array([[0.0, 1.0, -1.0] if kind == "revolute" else [0.0] * 3 for kind in arm.model.joint_kinds])
     turned = at[:, None] + 2.0 * np.pi * turns
@@ -199,7 +199,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     ]
 
 
-def _telling(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMotion | None:
+def _informative_motion(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMotion | None:
     """Motion that distinguishes the possible postures of an observation; None if one remains, or no motion does."""
     import numpy as np
 
@@ -208,12 +208,12 @@ def _telling(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMot
     if not found.alternatives:
         return None
     postures = look.readings + np.array([found.offset, *found.alternatives])
-    least_px = TELLS_PX + _tolerance_px(arm)
+    least_px = LEAST_DIFFERENCE_PX + _tolerance_px(arm)
     return telling_motion(arm.model, postures, look.readings, arm.limits, PROBE, least_px)
 
 
-def _right(found: JointZeros) -> bool:
-    return bool((abs(found.offset) <= AGREES * found.deviations).all())
+def _zeros_hold(found: JointZeros) -> bool:
+    return bool((abs(found.offset) <= AGREEMENT_SIGMA * found.deviations).all())
 
 
 def _tolerance_px(arm: LearntArm) -> float:
@@ -263,10 +263,10 @@ def _report(
         for j, joint in enumerate(model.joint_names)
     ]
     postures = [(readings + offset).tolist() for offset in (found.offset, *found.alternatives)]
-    lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _right(found))
+    lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _zeros_hold(found))
     state = "not moved" if check else "home"
     lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(observations)} looks")
-    if decided and not _right(found):
+    if decided and not _zeros_hold(found):
         log(
             f"one look may show a body, base or cameras that moved as zeros that are off: `stereoservo home {name} "
             "--by-vision` looks again from elsewhere"

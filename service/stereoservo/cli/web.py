@@ -89,13 +89,13 @@ def web(
             log(f"token to command the arm as {operate}, good for one use: {token}")
 
     interruption.check()  # an interrupt that was lost while packages were imported
-    with interruption.ending(END_S) as ending:
+    with interruption.graceful_shutdown(END_S) as shutdown:
         server = PageServer(make_link, operate, announce)
-        asyncio.run(_serve(server, address, port, context, host or [], tokens, json, ending))
-        left = interruption.threads_left(THREADS_S)
+        asyncio.run(_serve(server, address, port, context, host or [], tokens, json, shutdown))
+        left = interruption.unfinished_threads(THREADS_S)
         if left:
             log(f"ended without waiting for what does not answer: {', '.join(left)}")
-            interruption.leave(0)
+            interruption.exit_now(0)
 
 
 def _check_names(hosts: list[str], operator: str | None) -> None:
@@ -120,7 +120,7 @@ async def _serve(
     names: list[str],
     tokens: list[str],
     as_json: bool,
-    ending: interruption.Ending,
+    shutdown: interruption.ShutdownRequest,
 ) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -128,7 +128,7 @@ async def _serve(
     def wake() -> None:
         loop.call_soon_threadsafe(ended.set)
 
-    ending.wake = wake
+    shutdown.wake = wake
     try:
         found = await server.start(address, port, context, names)
     except OSError as error:
@@ -138,7 +138,7 @@ async def _serve(
         shown = f"[{address}]" if ":" in address else address
         url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
         emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
-        if not ending.asked:
+        if not shutdown.asked:
             await ended.wait()
         log(
             f"ending: pages are closed, and what they have started stops; by force after {END_S:g} s, or at once by a "

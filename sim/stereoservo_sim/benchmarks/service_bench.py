@@ -211,9 +211,9 @@ class ServiceBench:
         if self.daemon.process.poll() is not None:
             self.end_daemon()
             self.start()
-        self.asked(_operated)
+        self.query(_operated)
 
-    def asked(self, ask: Callable[[Client], T]) -> T:
+    def query(self, ask: Callable[[Client], T]) -> T:
         """The answer of a daemon whose gateway may be restarting. Raises ClientError, SessionError."""
         until = time.monotonic() + READY_S
         while True:
@@ -225,7 +225,7 @@ class ServiceBench:
                     raise
                 time.sleep(0.1)
 
-    def query_ready_cell(self, ask: Callable[[Client], T]) -> T:
+    def query_ready(self, ask: Callable[[Client], T]) -> T:
         """The answer of a cell that is made ready first, again if a stalled machine stopped it since."""
 
         def operated(client: Client) -> T:
@@ -233,7 +233,7 @@ class ServiceBench:
             return ask(client)
 
         self.ready()
-        return self.asked(operated)
+        return self.query(operated)
 
     def delete_state(self) -> None:
         """Remove the models and taught goals of a trial, and the disk they are on."""

@@ -420,7 +420,7 @@ def _killed(bench: ServiceBench, rng: np.random.Generator) -> Trial:
         end = -END if client.status().joints["j1"] > 0.0 else END
         client.goal({"j1": end}, speed_scale=SPEED_SCALE, lease_s=None)
 
-    bench.query_ready_cell(begin)
+    bench.query_ready(begin)
     begin_ns = time.monotonic_ns()
     time.sleep(float(rng.uniform(YOUNG_S + 0.3, 3.0)))
     processes = bench.processes()
@@ -539,7 +539,7 @@ class _LiveSoak:
             self.client.hold()
             time.sleep(HELD_S)
         finally:  # a hold may take effect even if its answer was late
-            self.bench.asked(lambda client: client.resume())
+            self.bench.query(lambda client: client.resume())
 
     def one_goal(self) -> None:
         """Send a goal, inject a fault into the daemon in half of the cases, and wait for its end. Raises

@@ -140,7 +140,7 @@ def records_again(bench: ServiceBench) -> str:
             time.sleep(0.05)
         return True
 
-    if not bench.asked(ring_grows):
+    if not bench.query(ring_grows):
         return f"the flight ring is not written {GROWS_S:g} s after there was room"
     try:
         _record(bench)
@@ -532,7 +532,7 @@ def _afterwards(
         time.sleep(0.3)
         return client.events(0).events, client.status().notes
 
-    events, notes = bench.asked(told)
+    events, notes = bench.query(told)
     ended = [event for event in (*told_live, *events) if event.kind in TERMINAL]
     ends = [{(event.boot, event.seq) for event in ended if event.id == goal} for goal in bench.goals]
     return tuple(map(len, ends)), tuple(note.replace(f"{bench.folder}/", "") for note in notes)
