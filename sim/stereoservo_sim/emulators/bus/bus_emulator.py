@@ -759,14 +759,6 @@ def _calm(emulator: BusEmulator, command: BusCommand) -> str:
     return f"node {command.node}: calm"
 
 
-def _status(emulator: BusEmulator, command: BusCommand) -> str:
-    return "\n".join(emulator.status())
-
-
-def _help(emulator: BusEmulator, command: BusCommand) -> str:
-    return "\n".join(LANGUAGE.help_lines())
-
-
 def frame_id(node_id: int, what: str) -> int:
     """CAN id of a node's frame: by its name in the predefined connection set, or itself as ``0x…``."""
     return int(what, 16) if what.startswith("0x") else COB_IDS[what] + node_id
@@ -827,9 +819,8 @@ LANGUAGE = FaultLanguage(
         ),
         "block": Verb("block N", "the joint of node N is in contact: it cannot move", _block, (NODE,), lasting=True),
         "free": Verb("free N", "ends `block`", _free, (NODE,)),
-        "status": Verb("status", "the state of all drives", _status, logged=False),
-        "help": Verb("help", "this list", _help, logged=False),
     },
+    devices="drives",
     example="silence 4",
 )  # fmt: skip
 """The console language of ``emulate drives``."""

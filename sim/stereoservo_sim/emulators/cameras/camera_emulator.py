@@ -411,14 +411,6 @@ def _clear(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComm
     return "as the cell file has it"
 
 
-def _status(emulator: CameraEmulator, command: CameraCommand) -> str:
-    return "\n".join(emulator.status())
-
-
-def _help(emulator: CameraEmulator, command: CameraCommand) -> str:
-    return "\n".join(LANGUAGE.help_lines())
-
-
 LANGUAGE = FaultLanguage(
     CameraCommand,
     {
@@ -482,9 +474,8 @@ LANGUAGE = FaultLanguage(
             _bump, parse=_bump_words,
         ),
         "clear": Verb("clear CAM", "takes back everything but `bump`", _clear, (CAMERA,)),
-        "status": Verb("status", "the state of all cameras", _status, logged=False),
-        "help": Verb("help", "this list", _help, logged=False),
     },
+    devices="cameras",
     example="freeze left",
     note="; CAM may be all",
 )  # fmt: skip
