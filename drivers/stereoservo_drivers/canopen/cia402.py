@@ -38,6 +38,7 @@ from stereoservo_drivers.position_output import PositionOutput
 SYNC_ID = 0x080
 EMCY_ID = 0x080
 HEARTBEAT_ID = 0x700
+SDO_REQUEST_ID, SDO_RESPONSE_ID = 0x600, 0x580
 RPDO_IDS = (0x200, 0x300, 0x400, 0x500)
 TPDO_IDS = (0x180, 0x280, 0x380, 0x480)
 

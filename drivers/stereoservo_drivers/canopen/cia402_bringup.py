@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
+from stereoservo_drivers.canopen.cia402 import (
+    EMCY_ID,
+    HEARTBEAT_ID,
+    SDO_REQUEST_ID,
+    SDO_RESPONSE_ID,
+    Cia402Codec,
+    DriveAxis,
+)
 from stereoservo_drivers.canopen.cia402_configuration import (
     ABORT_OPTION,
     INTERPOLATION_EXPONENT,
@@ -168,8 +175,7 @@ class Cia402Bringup:
                     if known and self._options.abort_option == 1:
                         drive.write(*ABORT_OPTION, 0)  # leaving operational would cause a fault
                     drive.nmt("PRE-OPERATIONAL")
-                    for write in unwatch_writes(setup) if setup is not None else []:
-                        drive.write(write.index, write.subindex, write.value)
+                    drive.write_all(unwatch_writes(setup) if setup is not None else [])
                 except DriverError as error:
                     failed.append(error)
                     if error.code == "connection_lost":
@@ -254,8 +260,7 @@ class Cia402Bringup:
         off = [write for index in unused for write in self._off(drive, index)]
         # Without guarding from an earlier master: a life time that expires now would cause a fault.
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
-        for write in (*first, *identifiers, *off, *parameters):
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all((*first, *identifiers, *off, *parameters))
         if gripper is None:
             rest = self._set_mode(link, drive, setup, feedback)
         else:
@@ -269,8 +274,7 @@ class Cia402Bringup:
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
         pdos = pdo_writes(self._options, drive.node_id, setup, mode, feedback)
-        for write in pdos:
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all(pdos)
         self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
         return [*period, *pdos]
 
@@ -283,8 +287,7 @@ class Cia402Bringup:
         setup = self.setups[drive.node_id]
         writes = period_writes(self._options, drive.axis.joint, setup, mode)
         try:
-            for write in writes:
-                drive.write(write.index, write.subindex, write.value, write.option)
+            drive.write_all(writes)
         except DriverError as error:
             if mode != "csv" or error.data.get("abort_code") != ABORT_READ_ONLY:
                 raise
@@ -344,8 +347,7 @@ class Cia402Bringup:
         """Activate the drives' monitoring of this master, go operational, check that all report so."""
         for drive in drives:
             writes = watch_writes(self._options, self.setups[drive.node_id])
-            for write in writes:
-                drive.write(write.index, write.subindex, write.value, write.option)
+            drive.write_all(writes)
             for write in writes:
                 self._compare(drive, write)
             _read_initial_state(drive)
@@ -473,7 +475,6 @@ def _reports(heartbeats: list[CanFrame], state: NmtState) -> Callable[[], bool]:
 # Digital outputs of an arm's drives, written by SDO beside the cycle.
 
 
-SDO_ORDER_ID, SDO_ANSWER_ID = 0x600, 0x580
 DOWNLOAD_OUTPUTS = bytes([0x23, 0xFE, 0x60, 1])
 """Head of an SDO download of four bytes to 0x60FE:1 (CiA 301, 7.2.4.3.3)."""
 DOWNLOADED = 0x60
@@ -524,7 +525,7 @@ class DigitalOutputs:
         self._link = link
         for node in self._ordered:
             self._answers[node] = []
-            link.subscribe(SDO_ANSWER_ID + node, self._answers[node])
+            link.subscribe(SDO_RESPONSE_ID + node, self._answers[node])
 
     def write(self, link: Link, values: Mapping[str, float]) -> None:
         """Switch outputs by name. Raises DriverError (``auxiliary``, ``connection_lost``)."""
@@ -557,7 +558,7 @@ class DigitalOutputs:
                 self._due.add(node)
         for node in sorted(self._due - self._sent.keys()):
             bits = self._ordered[node]
-            link.send([CanFrame(SDO_ORDER_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little"))])
+            link.send([CanFrame(SDO_REQUEST_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little"))])
             self._due.discard(node)
             self._sent[node] = bits, now_ns
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import configparser
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, FEEDBACK_OBJECTS, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.option_checks import parse_sdo_key
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CommandMode
 from stereoservo_drivers.canopen.units import JointScale
 
@@ -35,7 +35,7 @@ TARGETS: dict[CommandMode, tuple[int, int]] = {
     "ip": (0x60C1, 1),
 }
 """Object of the set-point of each mode."""
-FEEDBACK_INDEX = {"velocity": 0x606C, "effort": 0x6077, "following_error": 0x60F4, "switches": 0x60FD}
+FEEDBACK_INDEX = {what: entry >> 16 for what, (entry, _) in FEEDBACK_OBJECTS.items()}
 HEARTBEAT_CONSUMER = (0x1016, 1)
 GUARD_TIME, LIFE_FACTOR = (0x100C, 0), (0x100D, 0)
 DEADLINE = (0x1400, 5)
@@ -213,8 +213,6 @@ RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 PDO_RANGE = 0x200
 
-_OBJECT = re.compile(r"\s*(0[xX][0-9a-fA-F]{1,4})\s*(?::\s*(\d{1,3}|0[xX][0-9a-fA-F]{1,2}))?\s*")
-
 
 @dataclass(frozen=True)
 class Write:
@@ -236,19 +234,6 @@ class Write:
     def agrees(self, read: int) -> bool:
         """Whether a value read back agrees with the one written."""
         return (read ^ self.value) & self.mask == 0
-
-
-def parse_object(name: str, joint: str) -> tuple[int, int]:
-    """Parse ``0x60C2:1`` as index and sub-index (0 if omitted). Raises DriverError (``option``)."""
-    match = _OBJECT.fullmatch(name)
-    if match is None or int(match[2] or "0", 0) > 0xFF:
-        raise DriverError(
-            "option",
-            f"joint {joint!r}: sdo key {name!r} is no object; write it like 0x60C2:1 (index and sub-index)",
-            joint=joint,
-            key=name,
-        )
-    return int(match[1], 16), int(match[2] or "0", 0)
 
 
 def identifier_writes(node_id: int) -> list[Write]:
@@ -274,14 +259,14 @@ def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list
         *(Write(*key, limit, option="max_velocity") for key in SPEEDS),
         *(Write(*key, acceleration, option="max_acceleration") for key in RAMPS),
     ]
-    own = [Write(*parse_object(name, joint.name), value, option="sdo") for name, value in joint.sdo.items()]
+    own = [Write(*parse_sdo_key(name), value, option="sdo") for name, value in joint.sdo.items()]
     there = [write for write in writes if write.key == (0x1017, 0) or setup.capabilities.has(write.key)]
     return list({write.key: write for write in (*there, *own)}.values())
 
 
 def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: CommandMode) -> list[Write]:
     """Writes of the period of set-points in the modes that interpolate, if the drive has the object."""
-    told = {parse_object(name, joint.name) for name in joint.sdo}
+    told = {parse_sdo_key(name) for name in joint.sdo}
     has = setup.capabilities.values
     if mode == "pv" or INTERPOLATION_TIME not in has or INTERPOLATION_TIME in told:
         return []

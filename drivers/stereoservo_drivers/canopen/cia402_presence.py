@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
+from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SDO_REQUEST_ID, SDO_RESPONSE_ID
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.codec import Link, listening, until
 from stereoservo_drivers.canopen.options import CanOptions
@@ -93,14 +93,14 @@ def read_from_nodes(
 ) -> dict[int, list[CanFrame]]:
     """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
-    with listening(link, [0x580 + node for node in nodes]) as received:
+    with listening(link, [SDO_RESPONSE_ID + node for node in nodes]) as received:
         for node in nodes:
-            link.send([CanFrame(0x600 + node, request)])
+            link.send([CanFrame(SDO_REQUEST_ID + node, request)])
         link.wait(PROBE_S)
         if patience_s > PROBE_S and not all(received.values()):
             until(link, lambda: all(received.values()), patience_s - PROBE_S)
             link.wait(PROBE_S)
-    return {node: received[0x580 + node] for node in nodes}
+    return {node: received[SDO_RESPONSE_ID + node] for node in nodes}
 
 
 def require_nodes(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:

@@ -130,8 +130,7 @@ class Gripper:
         ]
         drive.write(0x6060, 0, PROFILE_POSITION, "mode")
         until(link, lambda: drive.read(0x6061) == PROFILE_POSITION, MODE_S)
-        for write in pdos:
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all(pdos)
         return [Write(0x6061, 0, PROFILE_POSITION, option="mode"), *pdos]
 
     def listen(self, link: Link) -> None:
