@@ -40,11 +40,11 @@ TODAY = {
 """Figures that are beyond what is asked: they may only fall, and whoever makes one smaller lowers it here."""
 MODULE_LINES, FUNCTION_LINES = 900, 80
 KERNEL_ARGUMENTS = 6
-PARAMETERS, VERBS = 10, 4
-"""Parameters of a function; and verbs of the command line that have more, one for each option."""
-CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 105_500, 545, 130
+PARAMETERS, VERBS = 10, 0
+"""Parameters of a function; and verbs of the command line that have more (options are fields of a dataclass)."""
+CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 103_600, 516, 129
 """Of the product: lines of code, its files, and statements that are not laid out by the formatter (`# fmt: skip`)."""
-ONE_IMPORTER, ONE_IN_FOLDER = 70, 43
+ONE_IMPORTER, ONE_IN_FOLDER = 57, 32
 """Modules that one other module alone imports, and those of them in its own folder: a piece that is not read without
 its importer stands in it. They may only become fewer, and whoever joins one lowers them here.
 """
