@@ -226,7 +226,7 @@ def test_all_feedback_takes_a_third_pdo(make_bench: Make) -> None:
 
 
 def test_further_writes_are_made_and_replace_the_driver_s_own(make_bench: Make) -> None:
-    joint = make_joint(1, sdo={"0x60C2:1": 4, "0x6080": 123_456, "0x607D:1": -200_000})
+    joint = make_joint(1, sdo={"0x60C2:1": 4, "0x6080:0": 123_456, "0x607D:1": -200_000})
     bench = make_bench(make_options(joint))
     bench.connect()
     assert bench.object(1, 0x60C2, 1) == 4
