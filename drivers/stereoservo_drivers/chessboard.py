@@ -13,14 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo.ports.devices import (
-    CameraObservation,
-    DetectorDescription,
-    DriverContext,
-    DriverError,
-    Frame,
-    Prior,
-)
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 

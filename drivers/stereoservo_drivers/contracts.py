@@ -210,10 +210,7 @@ class CameraDriverContract(PacedSuite):
             configured.poll()
 
     def test_call_times_beside_the_budget(
-        self,
-        active: CameraDriver,
-        context: DriverContext,
-        record_property: Callable[[str, object], None],
+        self, active: CameraDriver, context: DriverContext, record_property: Callable[[str, object], None]
     ) -> None:
         description = active.describe()
 

@@ -136,12 +136,7 @@ class FakeJointDriver(SimulatedArm):
         if frozen:
             return held
         return JointState(
-            state.seq,
-            state.t_ns,
-            held.positions,
-            np.zeros_like(held.velocities),
-            held.efforts,
-            held.following_errors,
+            state.seq, state.t_ns, held.positions, np.zeros_like(held.velocities), held.efforts, held.following_errors
         )
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:

@@ -93,9 +93,7 @@ class PybulletCameraDriver(SimulatedCamera):
         try:
             return Renderer(self.cell, self.camera, settings)
         except Exception as error:
-            from stereoservo_sim.world.physics import (
-                PhysicsError,
-            )  # loaded if the background is pybullet's
+            from stereoservo_sim.world.physics import PhysicsError  # loaded if the background is pybullet's
 
             if isinstance(error, PhysicsError):
                 raise DriverError("physics", str(error)) from error

@@ -24,13 +24,7 @@ from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.position_output import LEAD_S, LOAD_OFFSET, PositionOutput
 from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, place_of
 from stereoservo_sim.world.history import CAPACITY, FILE_NAME, HistoryError, TrueJointHistory
-from stereoservo_sim.world.mechanics import (
-    MechanicalPlant,
-    MechanicsOption,
-    chosen_mechanics,
-    column,
-    quantised,
-)
+from stereoservo_sim.world.mechanics import MechanicalPlant, MechanicsOption, chosen_mechanics, column, quantised
 from stereoservo_sim.world.robots import Robot
 from stereoservo_sim.world.simulated_cell import SimulatedCell
 from stereoservo_sim.world.velocity_drives import DriveBank, Plant, PositionBank
@@ -94,9 +88,7 @@ class SimulatedArm:
         self._robot = robot
         try:
             self._mechanics = chosen_mechanics(
-                options.mechanics,
-                [joint.name for joint in joints],
-                [joint.kind == "prismatic" for joint in joints],
+                options.mechanics, [joint.name for joint in joints], [joint.kind == "prismatic" for joint in joints]
             )
         except ValueError as error:
             raise DriverError("option", f"driver {self.driver!r}: {error}") from error

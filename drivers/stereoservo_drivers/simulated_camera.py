@@ -326,8 +326,7 @@ class SimulatedCamera:
         joints = len(self.cell.robot.joints)
         if history.joints != joints:
             raise DriverError(
-                "history",
-                f"the simulated arm has {history.joints} joints; this camera's cell has {joints}",
+                "history", f"the simulated arm has {history.joints} joints; this camera's cell has {joints}"
             )
         return history
 

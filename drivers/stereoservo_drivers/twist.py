@@ -17,12 +17,7 @@ from msgspec import Meta
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverContext, DriverError
 from stereoservo_drivers.fake import FakeJointDriver
-from stereoservo_drivers.kit.cartesian import (
-    CartesianJointDriver,
-    CartesianState,
-    Frame,
-    cartesian_description,
-)
+from stereoservo_drivers.kit.cartesian import CartesianJointDriver, CartesianState, Frame, cartesian_description
 from stereoservo_drivers.kit.virtual_joints import VirtualLimits, positions_of, turn
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.pybullet import PybulletJointDriver
@@ -192,10 +187,7 @@ class SimulatedController:
 
     def _ramp(self, dt: float) -> None:
         """Move the current twist towards the commanded one, slide and turn each at its acceleration."""
-        for part, acceleration in (
-            (slice(3), self._accelerations[0]),
-            (slice(3, 6), LEVER * self._accelerations[1]),
-        ):
+        for part, acceleration in ((slice(3), self._accelerations[0]), (slice(3, 6), LEVER * self._accelerations[1])):
             gap = self._twist[part] - self._at[part]
             size = float(np.linalg.norm(gap))
             self._at[part] += gap * min(1.0, acceleration * dt / max(size, 1e-12))

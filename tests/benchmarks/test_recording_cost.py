@@ -11,8 +11,7 @@ from stereoservo.ports.devices import CameraObservation
 from stereoservo.recording import step_layout
 from stereoservo.recording.compression import Checkpoints, StepBlocks
 from stereoservo.recording.step_layout import decode_step, encode_step
-from stereoservo_sim.benchmarks.core_loop import CoreLoop
-from stereoservo_sim.benchmarks.cycle import drive
+from stereoservo_sim.benchmarks.cycle import CoreLoop, drive
 from stereoservo_sim.world.synthetic import rx90
 
 

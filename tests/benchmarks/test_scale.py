@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
 from stereoservo_sim.benchmarks.cycle import (
     JOINTS,
     MARKERS,
+    CoreLoop,
     drive,
     exponents,
     power,
+    rx90_with_facets,
     with_joints,
     with_markers,
 )

@@ -12,8 +12,7 @@ import pytest
 import stereoservo
 from stereoservo.core.cycle import StepInputs
 from stereoservo.messages.goals import LawName
-from stereoservo_sim.benchmarks.core_loop import CoreLoop
-from stereoservo_sim.benchmarks.cycle import drive
+from stereoservo_sim.benchmarks.cycle import CoreLoop, drive
 from stereoservo_sim.world.synthetic import rx90
 
 PACKAGE = str(Path(stereoservo.__file__).parent)

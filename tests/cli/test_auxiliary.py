@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from stereoservo.cli import auxiliary
+from stereoservo.cli import operator_commands
+from stereoservo.cli.output import CellOptions
 from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
@@ -54,9 +55,9 @@ def test_it_waits_until_a_slow_gripper_is_there_or_stands(
     monkeypatch: pytest.MonkeyPatch, ordered: float, waits_s: float, ends_at: float
 ) -> None:
     gripper, told = Gripper(), []
-    monkeypatch.setattr(auxiliary, "Client", lambda *_, **__: gripper)
-    monkeypatch.setattr(auxiliary, "time", gripper)
-    monkeypatch.setattr(auxiliary, "emit", lambda state, *_: told.append(state.auxiliary["gripper"]))
-    auxiliary.auxiliary("demo", [f"gripper={ordered}"], wait=10.0)
+    monkeypatch.setattr(CellOptions, "client", lambda *_, **__: gripper)
+    monkeypatch.setattr(operator_commands, "time", gripper)
+    monkeypatch.setattr(CellOptions, "emit", lambda _, state, text: told.append(state.auxiliary["gripper"]))
+    operator_commands.auxiliary("demo", [f"gripper={ordered}"], wait=10.0)
     assert told == [pytest.approx(ends_at, abs=0.001)]
-    assert gripper.now_s == pytest.approx(waits_s, abs=auxiliary.STANDS_S + 0.2)
+    assert gripper.now_s == pytest.approx(waits_s, abs=operator_commands.STANDS_S + 0.2)

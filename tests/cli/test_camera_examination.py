@@ -27,7 +27,7 @@ from stereoservo.ports.devices import (
     Frame,
     Prior,
 )
-from stereoservo_drivers.edges.detector import EdgeDetector
+from stereoservo_drivers.edges import EdgeDetector
 from stereoservo_drivers.fake import FakeCameraDriver
 from stereoservo_sim.cells import shipped_cell_path
 

@@ -14,6 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 
+import stereoservo
 from stereoservo.cli import dispatch, output
 from stereoservo.cli import main as cli
 from stereoservo.cli.warmup import _wait
@@ -51,7 +52,13 @@ def cell(tmp_path: Path, run: Run) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", list(dispatch.COMMANDS))
+def test_the_package_is_the_command_line() -> None:
+    command = [sys.executable, "-m", "stereoservo.cli", "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=240)
+    assert done.stdout == f"stereoservo {stereoservo.__version__}\n"
+
+
+@pytest.mark.parametrize("command", list(dispatch.OWN))
 def test_every_command_has_help(command: str, capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.invoke([command, "--help"]) == 0
     out = capfd.readouterr().out
@@ -62,7 +69,7 @@ def test_every_command_has_help(command: str, capfd: pytest.CaptureFixture[str])
 def test_help_lists_all_commands_and_those_of_entry_points(capfd: pytest.CaptureFixture[str]) -> None:
     assert cli.invoke(["--help"]) == 0
     out = capfd.readouterr().out
-    for command in (*dispatch.COMMANDS, "reproduce"):
+    for command in (*dispatch.OWN, "reproduce"):
         assert f"\n  {command} " in out
 
 
@@ -388,7 +395,7 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch, run: Run) 
     def interrupted() -> list[Any]:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stereoservo.cli.ls.live_cells", interrupted)
+    monkeypatch.setattr("stereoservo.cli.status.live_cells", interrupted)
     code, result, _ = run("ls")
     assert (code, result["error"]["code"]) == (130, "interrupted")
 
@@ -396,7 +403,7 @@ def test_an_interrupt_exits_with_130(monkeypatch: pytest.MonkeyPatch, run: Run) 
 def test_an_unexpected_error_shows_its_traceback_and_still_one_json_object(
     monkeypatch: pytest.MonkeyPatch, run: Run
 ) -> None:
-    monkeypatch.setattr("stereoservo.cli.ls.live_cells", lambda: 1 / 0)
+    monkeypatch.setattr("stereoservo.cli.status.live_cells", lambda: 1 / 0)
     code, result, err = run("ls")
     assert code == 1
     assert result["error"]["message"] == "division by zero"
@@ -407,7 +414,7 @@ def test_a_full_disk_behind_stderr_loses_a_remark_alone(monkeypatch: pytest.Monk
     full = Path("/dev/full").open("w", buffering=1)  # noqa: SIM115 - what it holds is never written
     with monkeypatch.context() as patch:
         patch.setattr(sys, "stderr", full)
-        output.note("the cell is up")
+        output.log("the cell is up")
     with suppress(OSError):
         full.close()
 

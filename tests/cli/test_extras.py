@@ -79,7 +79,7 @@ def test_verbs_of_a_client_run_without_extras(tmp_path: Path, monkeypatch: pytes
     lines = [["--help"], ["ls"], ["stop", "nowhere"], ["goal", "nowhere", "dock"], ["watch", "nowhere"]]
     listed, cells, *others = answers(lines, tmp_path, *plugins.EXTRAS)
     assert listed[0] == 0
-    assert all(f"\n  {name} " in listed[1] for name in (*dispatch.COMMANDS, "demo", "reproduce"))
+    assert all(f"\n  {name} " in listed[1] for name in (*dispatch.OWN, "demo", "reproduce"))
     assert cells == (0, "no live cell\n", "")
     for code, _, err in others:
         assert code == 1

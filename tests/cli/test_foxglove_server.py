@@ -45,7 +45,7 @@ def advertised(socket: Any, count: int) -> Iterator[dict[str, Any]]:
 def test_a_cell_is_served_with_foxgloves_schemas() -> None:
     from websockets.sync.client import connect
 
-    from stereoservo.cli.watch.foxglove_server import FoxgloveServer
+    from stereoservo.cli.foxglove_server import FoxgloveServer
 
     with FoxgloveServer("c", 0) as server:
         address = f"ws://127.0.0.1:{server.port}"

@@ -11,12 +11,11 @@ from typing import Any
 
 import pytest
 
-from stereoservo.cli import target_options
-from stereoservo.cli.goal import plan_table
+from stereoservo.cli import goal as goal_command
+from stereoservo.cli.goal import adaptive, make_goal, plan_table, stream_lines, target_tree
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
 from stereoservo.cli.status import progress_words
-from stereoservo.cli.target_options import adaptive, make_goal, stream_lines, target_tree
 from stereoservo.cli.teach import read_drawing
 from stereoservo.messages.goals import (
     AdaptiveGain,
@@ -125,7 +124,7 @@ def test_a_stream_in_a_file_is_paced_by_its_stamps(tmp_path: Path, monkeypatch: 
         slept.append(seconds)
         now += seconds
 
-    monkeypatch.setattr(target_options, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
+    monkeypatch.setattr(goal_command, "time", SimpleNamespace(monotonic=lambda: now, sleep=sleep))
     found = list(stream_lines(str(path)))
     assert [stamp for stamp, _ in found] == [7.0, 7.5, 8.0]
     assert slept == [0.0, 0.5, 0.5]

@@ -36,11 +36,11 @@ class ArmInPictures:
         self.readings = world.base + away * self.rng.uniform(-1, 1, len(world.base)) - self.off
         self.moves: list[np.ndarray] = []
 
-    def look(self, *_: Any) -> home.Look:
+    def look(self, *_: Any) -> home.Observation:
         model = self.arm.model
         pixels = predicted_pixels(seen_chain(model), (self.readings + self.off)[None], model.marker_points)[0]
         pixels += self.rng.normal(0, NOISE_PX, pixels.shape)
-        return home.Look(self.readings.copy(), pixels, np.full(pixels.shape[:2], SIGMA_PX))
+        return home.Observation(self.readings.copy(), pixels, np.full(pixels.shape[:2], SIGMA_PX))
 
     def move(self, client: Any, arm: LearntArm, readings: np.ndarray, speed_scale: float) -> None:
         self.moves.append(readings - self.readings)
@@ -50,7 +50,7 @@ class ArmInPictures:
 def told(
     one: ArmInPictures, check: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> tuple[dict[str, Any], str]:
-    monkeypatch.setattr(home, "_look", one.look)
+    monkeypatch.setattr(home, "_observe", one.look)
     monkeypatch.setattr(home, "_move", one.move)
     client: Any = SimpleNamespace(cell=one.arm.cell.cell.name)
     home._by_vision(client, one.arm, check, 1.0, True)
@@ -80,15 +80,15 @@ def test_a_healthy_arm_is_told_no_zero(
 def test_the_motion_that_is_named_tells_postures_apart(name: str) -> None:
     for seed in range(2):
         one = ArmInPictures(name, seed)
-        looks = [one.look()]
-        before = home._zeros(one.arm, looks)
-        motion = home._telling(one.arm, looks[0], before)
+        observations = [one.look()]
+        before = home._estimate_zeros(one.arm, observations)
+        motion = home._informative_motion(one.arm, observations[0], before)
         assert motion is not None
         assert motion.told >= 12  # of 28 pairs: half of the postures at least
         one.readings[motion.joint] += motion.step
-        after = home._zeros(one.arm, [*looks, one.look()])
+        after = home._estimate_zeros(one.arm, [*observations, one.look()])
         assert len(after.alternatives) <= len(before.alternatives) // 2, seed
-        assert (np.abs(after.offset) <= home.AGREES * after.deviations).all()
+        assert (np.abs(after.offset) <= home.AGREEMENT_SIGMA * after.deviations).all()
 
 
 @pytest.mark.parametrize("off", [np.zeros(6), np.array([0.06, -0.04, 0.05, -0.2, 0.1, 0.3])], ids=["right", "off"])
@@ -103,7 +103,7 @@ def test_looks_after_motions_decide(
         assert found["alternatives"] == 0
         assert found["looks"] == 1 + len(one.moves) > 1
         for row, true in zip(found["joints"], off, strict=True):
-            assert row["zero_off_by"] == pytest.approx(-true, abs=home.AGREES * row["deviation"])
+            assert row["zero_off_by"] == pytest.approx(-true, abs=home.AGREEMENT_SIGMA * row["deviation"])
         assert ("--reset-zeros" in remarks) == bool(off.any())
 
 
@@ -111,11 +111,11 @@ def test_postures_beyond_the_cells_limits_are_no_zeros() -> None:
     """The pictures alone show j2 off by half a radian; where its limits forbid the place, that is no zero's error."""
     off = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.0])
     one = ArmInPictures("demo", 0, off, away=0.0)
-    looks = [one.look()]
+    observations = [one.look()]
     for joint in (4, 2):
         one.readings[joint] += home.PROBE
-        looks.append(one.look())
-    assert home._zeros(one.arm, looks).offset == pytest.approx(off, abs=0.02)
+        observations.append(one.look())
+    assert home._estimate_zeros(one.arm, observations).offset == pytest.approx(off, abs=0.02)
     limits = tuple(
         msgspec.structs.replace(limit, max=-1.6) if limit.joint == "j2" else limit
         for limit in one.arm.cell.safety.limit
@@ -123,5 +123,5 @@ def test_postures_beyond_the_cells_limits_are_no_zeros() -> None:
     safety = msgspec.structs.replace(one.arm.cell.safety, limit=limits)
     bounded = LearntArm(msgspec.structs.replace(one.arm.cell, safety=safety), one.arm.model, None)
     with pytest.raises(CommandError, match=r"j2 at -1\.30.* no correction of a zero") as caught:
-        home._zeros(bounded, looks)
+        home._estimate_zeros(bounded, observations)
     assert caught.value.code == "outside_limits"

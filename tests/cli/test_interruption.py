@@ -107,9 +107,9 @@ def test_the_page_ends_by_an_interrupt_whatever_hangs(name: str) -> None:
 
 def test_within_an_ending_an_interrupt_raises_nothing_and_afterwards_it_does_again() -> None:
     before = signal.getsignal(signal.SIGINT)
-    with interruption.ending(60.0) as ending:
+    with interruption.graceful_shutdown(60.0) as shutdown:
         woken: list[bool] = []
-        ending.wake = lambda: woken.append(ending.asked)
+        shutdown.wake = lambda: woken.append(shutdown.asked)
         os.kill(os.getpid(), signal.SIGTERM)
         assert woken == [True]
         faulthandler.cancel_dump_traceback_later()

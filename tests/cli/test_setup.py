@@ -19,15 +19,15 @@ from stereoservo.cli.doctor.camera_findings import CameraRecord
 from stereoservo.cli.doctor.cameras import same_camera_twice
 from stereoservo.cli.doctor.plate_motion import examine_sides, judge_turn, turn_between
 from stereoservo.cli.output import CommandError, shipped_or_path
-from stereoservo.cli.setup.command import eye_finding
-from stereoservo.cli.setup.dialogue import Dialogue
-from stereoservo.cli.setup.interview import (
+from stereoservo.cli.setup.command import (
     chosen_cameras,
     chosen_order,
     chosen_ranges,
+    eye_finding,
     interview,
     joint_position,
 )
+from stereoservo.cli.setup.dialogue import Dialogue
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.ports.devices import CameraDescription, CameraObservation, DriverError
 from stereoservo.ports.discovery import BusScan, FoundCamera, FoundDrive, JointChoice

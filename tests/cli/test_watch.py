@@ -13,7 +13,7 @@ from stereoservo.messages.wire import EventMessage, FeaturesMessage
 
 @pytest.mark.skipif(importlib.util.find_spec("rerun") is None, reason="rerun-sdk (extra `watch`) is not installed")
 def test_rerun_is_given_every_value_with_its_time_and_the_names_of_joints(tmp_path: Path) -> None:
-    from stereoservo.cli.watch.rerun_viewer import RerunViewer
+    from stereoservo.cli.rerun_viewer import RerunViewer
 
     file = tmp_path / "one.rrd"
     with RerunViewer("cell", file) as viewer:

@@ -13,7 +13,7 @@ from stereoservo.numerics.linear import (
     orthonormal_rows,
     right_singular,
 )
-from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
+from stereoservo_sim.benchmarks.cycle import damped_least_squares_reference
 
 
 @pytest.mark.parametrize("seed", range(20))

@@ -1,6 +1,5 @@
 """The safety stage: what it promises, for any input."""
 
-import dataclasses
 import math
 from types import SimpleNamespace
 
@@ -464,10 +463,10 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
 
 
 def test_the_limits_are_those_of_the_cell():
-    names = {field.name for field in dataclasses.fields(SafetyLimits)} - {"joint_names", "features_fresh_s"}
+    names = {*SafetyLimits.__struct_fields__} - {"joint_names", "features_fresh_s"}
     limits = make_limits(keep_outs=[[[0.2, 0.4], [-0.3, 0.3], [-np.inf, np.inf]]])
     cell = SimpleNamespace(**{name: getattr(limits, name) for name in names})
     made = stage.safety_limits(SimpleNamespace(joint_names=limits.joint_names, limits=cell), 0.07)
-    for field in dataclasses.fields(SafetyLimits):
-        wanted = 0.07 if field.name == "features_fresh_s" else getattr(limits, field.name)
-        np.testing.assert_array_equal(getattr(made, field.name), wanted)
+    for name in SafetyLimits.__struct_fields__:
+        wanted = 0.07 if name == "features_fresh_s" else getattr(limits, name)
+        np.testing.assert_array_equal(getattr(made, name), wanted)

@@ -6,7 +6,7 @@ import pytest
 from stereoservo.control.stereo_cycle import StereoCycle, stereo_step
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.kernels import triangulate
-from stereoservo_sim.benchmarks.stereo_reference import stereo_law
+from stereoservo_sim.benchmarks.cycle import stereo_law
 
 
 def case(seed, n=6):

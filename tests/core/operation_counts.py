@@ -67,7 +67,7 @@ def recorded(path: Path, kinds: tuple[str, ...] = ()) -> list[str]:
         Request,
         RunGoal,
     )
-    from stereoservo_sim.benchmarks.core_loop import CoreLoop, largest_cell
+    from stereoservo_sim.benchmarks.cycle import CoreLoop, largest_cell
     from stereoservo_sim.world.exact_model import exact_model
 
     found: dict[str, RecordedStep] = {}

@@ -36,7 +36,7 @@ from stereoservo.messages.goals import (
     Teach,
     UpdateGoal,
 )
-from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
+from stereoservo_sim.benchmarks.cycle import CoreLoop, rx90_with_facets
 
 PACKAGE = str(Path(stereoservo.__file__).parent)
 

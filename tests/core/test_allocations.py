@@ -13,8 +13,8 @@ from stereoservo.core.cycle import StepInputs
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import Holding, ServoGoal
 from stereoservo.messages.goals import Goal, Request, RunGoal
-from stereoservo_sim.benchmarks import core_loop
-from stereoservo_sim.benchmarks.core_loop import CoreLoop
+from stereoservo_sim.benchmarks import cycle
+from stereoservo_sim.benchmarks.cycle import CoreLoop
 from stereoservo_sim.world.synthetic import rx90
 
 STEPS, WARM = 10_000, 1000
@@ -103,10 +103,10 @@ def loop_of(motion: str, core: type[Advancing] = Advancing) -> CoreLoop:
     return loop
 
 
-@pytest.mark.parametrize("every", [core_loop.FRAME_EVERY, 1], ids=["between frames", "frames in every step"])
+@pytest.mark.parametrize("every", [cycle.FRAME_EVERY, 1], ids=["between frames", "frames in every step"])
 @pytest.mark.parametrize("motion", ["rest", "stereo", "cartesian3"])
 def test_an_ordinary_step_keeps_nothing(motion: str, every: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(core_loop, "FRAME_EVERY", every)
+    monkeypatch.setattr(cycle, "FRAME_EVERY", every)
     loop = loop_of(motion)
     found = growth(loop, STEPS)
     assert isinstance(loop.core.state.source, Holding if motion == "rest" else ServoGoal)

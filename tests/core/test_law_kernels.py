@@ -10,7 +10,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.cycle import encode
 from stereoservo.core.state import ServoGoal
 from stereoservo.messages.goals import Goal, Request, RunGoal
-from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90
+from stereoservo_sim.benchmarks.cycle import CoreLoop, rx90
 
 COMPILED = [name for name, law in LAWS.items() if law.kernel is not None]
 

@@ -20,7 +20,7 @@ from stereoservo.core.state import ServoGoal
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.kinematics.model import save_model
 from stereoservo.messages.goals import Goal, Request, RunGoal
-from stereoservo_sim.benchmarks.core_loop import (
+from stereoservo_sim.benchmarks.cycle import (
     CORE_STAGES,
     PARTS,
     CoreLoop,

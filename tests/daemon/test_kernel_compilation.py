@@ -121,7 +121,7 @@ LARGE_BODY = """
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.daemon import kernel_compilation
 from stereoservo.numerics.compilation import overloads
-from stereoservo_sim.benchmarks.core_loop import CoreLoop, rx90_with_facets
+from stereoservo_sim.benchmarks.cycle import CoreLoop, rx90_with_facets
 from stereoservo_sim.world.exact_model import exact_model
 
 kernel_compilation.warm_up()

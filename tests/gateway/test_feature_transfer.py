@@ -4,8 +4,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.cli.goal import target_tree
 from stereoservo.cli.output import CommandError
-from stereoservo.cli.target_options import target_tree
 from stereoservo.gateway.goal_transfer import resolve
 from stereoservo.gateway.point_alignment import TransferError, fixed_line
 from stereoservo.messages.goals import Feature, TaughtTarget

@@ -13,7 +13,7 @@ from stereoservo.control.law import Options, Scene
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.kinematics.kernels import image_jacobian
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
+from stereoservo_sim.benchmarks.cycle import damped_least_squares_reference
 
 
 def joint_metric_reference(operators: FloatArray, matrices: FloatArray, points: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ import numpy as np
 from stereoservo.control.law import JacobianChoice, Options, Scene, Task
 from stereoservo.control.laws.stereo import held_gain
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
+from stereoservo_sim.benchmarks.cycle import damped_least_squares_reference
 
 
 def _seen(scene: Scene, task: Task) -> FloatArray:

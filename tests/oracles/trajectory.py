@@ -14,7 +14,7 @@ from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK
 from stereoservo.geometry.cameras import project_many
 from stereoservo.kinematics.composition import Composition, displacement
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.benchmarks.stereo_reference import damped_least_squares_reference
+from stereoservo_sim.benchmarks.cycle import damped_least_squares_reference
 
 
 def trajectory_velocity(scene: Scene, task: Task, options: Options) -> tuple[FloatArray, float]:

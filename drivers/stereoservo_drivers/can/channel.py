@@ -19,8 +19,7 @@ import msgspec
 
 from stereoservo.messages.addresses import Address
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan import SlcanBus, SlcanGarbledError, SlcanRefusedError
 from stereoservo_drivers.can.slcan_lines import flags_in_words
 
@@ -242,8 +241,7 @@ class Channel:
             return self._error("send_refused", f"{error}{self._status_text()}")
         if isinstance(error, SlcanGarbledError):
             return self._error(
-                "connection_lost",
-                f"{error}. Check the serial speed (`@…` in the channel) and the adapter's firmware",
+                "connection_lost", f"{error}. Check the serial speed (`@…` in the channel) and the adapter's firmware"
             )
         number = _errno(error)
         if isinstance(error, can.CanTimeoutError) or number in _FULL or "buffer full" in str(error).lower():

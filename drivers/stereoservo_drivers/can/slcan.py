@@ -22,8 +22,7 @@ import can
 import serial
 
 from stereoservo.messages.addresses import Address
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan_lines import (
     BEL,
     LineError,

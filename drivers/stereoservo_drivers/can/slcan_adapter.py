@@ -6,15 +6,7 @@ from binascii import Error as HexError
 from binascii import unhexlify
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.slcan_lines import (
-    BEL,
-    BITRATES,
-    CR,
-    LineError,
-    LineSplitter,
-    decode_frame,
-    encode_frame,
-)
+from stereoservo_drivers.can.slcan_lines import BEL, BITRATES, CR, LineError, LineSplitter, decode_frame, encode_frame
 
 _BITRATE_OF = {command.encode(): bitrate for bitrate, command in BITRATES.items()}
 _SHORT, _LONG = b"z\r", b"Z\r"

@@ -223,6 +223,5 @@ def _unforeseen(error: Exception) -> DriverError:
         trace = trace.tb_next
     where = f"{trace.tb_frame.f_code.co_name}, line {trace.tb_lineno}" if trace is not None else "?"
     return DriverError(
-        "internal",
-        f"the CAN master failed: {type(error).__name__}: {error} (in {where}); all axes are stopped",
+        "internal", f"the CAN master failed: {type(error).__name__}: {error} (in {where}); all axes are stopped"
     )

@@ -38,6 +38,7 @@ from stereoservo_drivers.position_output import PositionOutput
 SYNC_ID = 0x080
 EMCY_ID = 0x080
 HEARTBEAT_ID = 0x700
+SDO_REQUEST_ID, SDO_RESPONSE_ID = 0x600, 0x580
 RPDO_IDS = (0x200, 0x300, 0x400, 0x500)
 TPDO_IDS = (0x180, 0x280, 0x380, 0x480)
 
@@ -173,7 +174,7 @@ class DriveAxis:
         self._ignored_s = 0.0 if follows or not self._followed else self._ignored_s + period_s
         return self._ignored_s >= BIT_S
 
-    def take_status(self, status_word: int) -> None:
+    def set_status_word(self, status_word: int) -> None:
         """Store the newest status word."""
         self.status_word = status_word
         self.state = drive_state(status_word)
@@ -185,7 +186,7 @@ class DriveAxis:
             self._limited_s = self._asked = self._ignored_s = 0.0
             self._followed = False
 
-    def take_code(self, code: int) -> None:
+    def add_error_code(self, code: int) -> None:
         """Store an emergency's error code; 0 is the drive's error reset."""
         if code == 0:
             self.codes = []
@@ -292,7 +293,7 @@ class Cia402Codec:
                 return self._wrong_length(axis, "TPDO1", len(data), size)
             word, counts = unpack(data)
             if word != axis.status_word:
-                axis.take_status(word)
+                axis.set_status_word(word)
             positions[k] = position(unwrapped(counts))
             return bit
 
@@ -346,7 +347,7 @@ class Cia402Codec:
         if len(data) < 2:  # neither an error code nor the error reset that zeros would be
             return NOT_CYCLIC
         code = int.from_bytes(data[:2], "little")
-        axis.take_code(code)
+        axis.add_error_code(code)
         if code and code not in self._ignored and self._watching:
             self._event(axis, "emergency", f"emergency {error_words(code)}", code, error_hint(code))
         return NOT_CYCLIC
@@ -471,7 +472,7 @@ class Cia402Codec:
         """The master's heartbeat, operational."""
         return self._heartbeat
 
-    def _stand(self, words: list[ControlWord]) -> list[CanFrame]:
+    def _rest_frames(self, words: list[ControlWord]) -> list[CanFrame]:
         """Frames for axes without a commanded motion; enabled ones keep their last position set-point."""
         self._commanding = False
         held = np.array([axis.enabled and word in ENABLING for axis, word in zip(self.axes, words, strict=True)])
@@ -491,11 +492,11 @@ class Cia402Codec:
         0x00 and not 0x06 (shutdown): from every state it leads to switch on disabled, and from there only the whole
         enable sequence leads to power. It resets no fault. A moving axis would coast: stop it first.
         """
-        return self._stand([ControlWord.DISABLE_VOLTAGE] * len(self.axes))
+        return self._rest_frames([ControlWord.DISABLE_VOLTAGE] * len(self.axes))
 
     def enable(self) -> list[CanFrame]:
         """Frames: for every axis the next transition towards enabled from its newest status word."""
-        return self._stand([ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE) for axis in self.axes])
+        return self._rest_frames([ENABLE_STEPS.get(axis.state, ControlWord.DISABLE_VOLTAGE) for axis in self.axes])
 
     def command(self, velocities: FloatArray) -> list[CanFrame]:
         """Frames: enable operation (halt bit clear) with set-points for velocities (n,) [rad/s or m/s]."""
@@ -523,7 +524,7 @@ class Cia402Codec:
 
     def quick_stop(self) -> list[CanFrame]:
         """Frames: quick stop, target zero, in place of the stored cyclic control word."""
-        return self._stand([ControlWord.QUICK_STOP] * len(self.axes))
+        return self._rest_frames([ControlWord.QUICK_STOP] * len(self.axes))
 
     def sendable(self, velocities: FloatArray) -> FloatArray:
         """Velocities rounded to the drives' units, within 32 bits; unchanged for position set-points."""

@@ -14,7 +14,14 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, Cia402Codec, DriveAxis
+from stereoservo_drivers.canopen.cia402 import (
+    EMCY_ID,
+    HEARTBEAT_ID,
+    SDO_REQUEST_ID,
+    SDO_RESPONSE_ID,
+    Cia402Codec,
+    DriveAxis,
+)
 from stereoservo_drivers.canopen.cia402_configuration import (
     ABORT_OPTION,
     INTERPOLATION_EXPONENT,
@@ -37,7 +44,13 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     unwatch_writes,
     watch_writes,
 )
-from stereoservo_drivers.canopen.cia402_presence import Identity, alone, find, identify, unbroken
+from stereoservo_drivers.canopen.cia402_presence import (
+    Identity,
+    identify,
+    reject_reboots,
+    require_nodes,
+    require_single_master,
+)
 from stereoservo_drivers.canopen.cia402_words import (
     ABORT_READ_ONLY,
     FAULTY,
@@ -105,14 +118,14 @@ class Cia402Bringup:
         """
         self._ignore()
         with self._drives(link) as drives:
-            alone(link, drives)
+            require_single_master(link, drives)
             # Axes that a dead master has left moving: before anything that can fail, and while they accept process
             # data.
             link.send(self.codec.quick_stop())
             link.wait(TAKEN_S)
-            with unbroken(link, drives):
-                self._quiet(drives)
-                find(link, drives, self._options)
+            with reject_reboots(link, drives):
+                self._enter_pre_operational(drives)
+                require_nodes(link, drives, self._options)
                 self._prepare(link, drives)
                 self._start(link, drives)
         self.outputs.listen(link)
@@ -127,10 +140,10 @@ class Cia402Bringup:
         """
         self._ignore()
         with self._drives(link) as drives:
-            self._quiet(drives)
-            find(link, drives, self._options)
+            self._enter_pre_operational(drives)
+            require_nodes(link, drives, self._options)
             self._reset_communication(link, [drive for drive in drives if _lost_the_bus(drive)])
-            with unbroken(link, drives):
+            with reject_reboots(link, drives):
                 self._prepare(link, drives)
                 stays: DriverError | None = None
                 try:
@@ -162,8 +175,7 @@ class Cia402Bringup:
                     if known and self._options.abort_option == 1:
                         drive.write(*ABORT_OPTION, 0)  # leaving operational would cause a fault
                     drive.nmt("PRE-OPERATIONAL")
-                    for write in unwatch_writes(setup) if setup is not None else []:
-                        drive.write(write.index, write.subindex, write.value)
+                    drive.write_all(unwatch_writes(setup) if setup is not None else [])
                 except DriverError as error:
                     failed.append(error)
                     if error.code == "connection_lost":
@@ -196,7 +208,7 @@ class Cia402Bringup:
         for gripper in self.grippers.values():
             gripper.ignore()
 
-    def _quiet(self, drives: list[RemoteDrive]) -> None:
+    def _enter_pre_operational(self, drives: list[RemoteDrive]) -> None:
         for drive in drives:
             drive.nmt("PRE-OPERATIONAL")
 
@@ -232,10 +244,8 @@ class Cia402Bringup:
             drive.write(0x6040, 0, ControlWord.DISABLE_VOLTAGE)
         off = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
         if not until(link, lambda: _state(drive) in off, REST_S if state in FAULTY else STATE_S):
-            raise DriverError(
-                "not_off",
-                f"{drive.name}: does not switch off, it says {drive.axis.words()!r}; switch its supply off and on",
-                node_id=drive.node_id,
+            raise drive.error(
+                "not_off", f"does not switch off, it says {drive.axis.words()!r}; switch its supply off and on"
             )
 
     def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> None:
@@ -250,23 +260,21 @@ class Cia402Bringup:
         off = [write for index in unused for write in self._off(drive, index)]
         # Without guarding from an earlier master: a life time that expires now would cause a fault.
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
-        for write in (*first, *identifiers, *off, *parameters):
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all((*first, *identifiers, *off, *parameters))
         if gripper is None:
-            rest = self._take_mode(link, drive, setup, feedback)
+            rest = self._set_mode(link, drive, setup, feedback)
         else:
-            rest = gripper.take_mode(link, drive)
+            rest = gripper.set_mode(link, drive)
         for write in {write.key: write for write in (*identifiers, *off, *parameters, *rest)}.values():
             self._compare(drive, write)
         self.outputs.prepare(drive)
 
-    def _take_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
+    def _set_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
         """Write mode, period and PDOs of a joint's drive; returns the writes to read back. Raises DriverError."""
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
         pdos = pdo_writes(self._options, drive.node_id, setup, mode, feedback)
-        for write in pdos:
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all(pdos)
         self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
         return [*period, *pdos]
 
@@ -279,8 +287,7 @@ class Cia402Bringup:
         setup = self.setups[drive.node_id]
         writes = period_writes(self._options, drive.axis.joint, setup, mode)
         try:
-            for write in writes:
-                drive.write(write.index, write.subindex, write.value, write.option)
+            drive.write_all(writes)
         except DriverError as error:
             if mode != "csv" or error.data.get("abort_code") != ABORT_READ_ONLY:
                 raise
@@ -326,12 +333,11 @@ class Cia402Bringup:
         found = drive.read(write.index, write.subindex)
         if not write.agrees(found):
             name = drive.object_name(write.index, write.subindex)
-            raise DriverError(
+            raise drive.error(
                 "read_back",
-                f"{drive.name}: {name} reads {found} (0x{found & 0xFFFFFFFF:X}), "
+                f"{name} reads {found} (0x{found & 0xFFFFFFFF:X}), "
                 f"written was {write.value} (0x{write.value & 0xFFFFFFFF:X}); the drive limits or ignores it: set "
                 f"{write.option or 'the drive up so'} that it fits",
-                node_id=drive.node_id,
                 object=f"0x{write.index:04X}:{write.subindex}",
                 written=write.value,
                 found=found,
@@ -341,8 +347,7 @@ class Cia402Bringup:
         """Activate the drives' monitoring of this master, go operational, check that all report so."""
         for drive in drives:
             writes = watch_writes(self._options, self.setups[drive.node_id])
-            for write in writes:
-                drive.write(write.index, write.subindex, write.value, write.option)
+            drive.write_all(writes)
             for write in writes:
                 self._compare(drive, write)
             _read_initial_state(drive)
@@ -353,12 +358,11 @@ class Cia402Bringup:
             for drive in drives:
                 heartbeats = received[HEARTBEAT_ID + drive.node_id]
                 if not until(link, _reports(heartbeats, NmtState.OPERATIONAL), limit_s):
-                    raise DriverError(
+                    raise drive.error(
                         "not_operational",
-                        f"{drive.name}: no heartbeat says operational within {limit_s:g} s after NMT start; "
+                        f"no heartbeat says operational within {limit_s:g} s after NMT start; "
                         f"{len(heartbeats)} heartbeats came",
                         retry=True,
-                        node_id=drive.node_id,
                     )
         self.codec.watch()
 
@@ -372,12 +376,10 @@ class Cia402Bringup:
             for drive in drives:
                 heartbeats = received[HEARTBEAT_ID + drive.node_id]
                 if not until(link, _reports(heartbeats, NmtState.BOOT_UP), BOOT_S):
-                    raise DriverError(
+                    raise drive.error(
                         "no_boot_up",
-                        f"{drive.name}: no boot-up within {BOOT_S:g} s after NMT reset communication; switch its "
-                        "supply off and on",
+                        f"no boot-up within {BOOT_S:g} s after NMT reset communication; switch its supply off and on",
                         retry=True,
-                        node_id=drive.node_id,
                     )
 
     def _clear_fault(self, link: Link, drive: RemoteDrive) -> None:
@@ -407,12 +409,11 @@ class Cia402Bringup:
     @staticmethod
     def _stays(drive: RemoteDrive) -> DriverError:
         code = drive.read_if_there(0x603F) or (drive.axis.codes[-1] if drive.axis.codes else 0)
-        return DriverError(
+        return drive.error(
             "fault_stays",
-            f"{drive.name}: {error_words(code)} is still there after the reset (state {drive.axis.state.value!r}); "
+            f"{error_words(code)} is still there after the reset (state {drive.axis.state.value!r}); "
             f"remove the cause first: {error_hint(code)}",
             retry=True,
-            node_id=drive.node_id,
             error_code=code,
             state=drive.axis.state.value,
         )
@@ -431,7 +432,7 @@ def _out_of_range(error: DriverError) -> bool:
 
 def _state(drive: RemoteDrive) -> DriveState:
     """Drive state read by SDO; the codec stores it as the newest."""
-    drive.axis.take_status(drive.read(0x6041))
+    drive.axis.set_status_word(drive.read(0x6041))
     return drive.axis.state
 
 
@@ -454,7 +455,7 @@ def _read_initial_state(drive: RemoteDrive) -> None:
     """Read state, error code and limit switches before the first cycle."""
     axis = drive.axis
     if _state(drive) in FAULTY:
-        axis.take_code(drive.read_if_there(0x603F) or 0)
+        axis.add_error_code(drive.read_if_there(0x603F) or 0)
     if axis.at_limit:
         switches = drive.read_if_there(0x60FD) or 0
         axis.limit_side = axis.joint.direction * ((switches >> 1 & 1) - (switches & 1))
@@ -474,7 +475,6 @@ def _reports(heartbeats: list[CanFrame], state: NmtState) -> Callable[[], bool]:
 # Digital outputs of an arm's drives, written by SDO beside the cycle.
 
 
-SDO_ORDER_ID, SDO_ANSWER_ID = 0x600, 0x580
 DOWNLOAD_OUTPUTS = bytes([0x23, 0xFE, 0x60, 1])
 """Head of an SDO download of four bytes to 0x60FE:1 (CiA 301, 7.2.4.3.3)."""
 DOWNLOADED = 0x60
@@ -511,9 +511,7 @@ class DigitalOutputs:
         if found is None:
             names = ", ".join(output.name for output in used)
             raise DriverError(
-                "outputs",
-                f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}",
-                node_id=drive.node_id,
+                "outputs", f"{drive.name} has no digital outputs (0x60FE:1); leave out: {names}", node_id=drive.node_id
             )
         mask = drive.read_if_there(*OUTPUT_MASK)
         if mask is not None:
@@ -527,7 +525,7 @@ class DigitalOutputs:
         self._link = link
         for node in self._ordered:
             self._answers[node] = []
-            link.subscribe(SDO_ANSWER_ID + node, self._answers[node])
+            link.subscribe(SDO_RESPONSE_ID + node, self._answers[node])
 
     def write(self, link: Link, values: Mapping[str, float]) -> None:
         """Switch outputs by name. Raises DriverError (``auxiliary``, ``connection_lost``)."""
@@ -560,7 +558,7 @@ class DigitalOutputs:
                 self._due.add(node)
         for node in sorted(self._due - self._sent.keys()):
             bits = self._ordered[node]
-            link.send([CanFrame(SDO_ORDER_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little"))])
+            link.send([CanFrame(SDO_REQUEST_ID + node, DOWNLOAD_OUTPUTS + bits.to_bytes(4, "little"))])
             self._due.discard(node)
             self._sent[node] = bits, now_ns
 

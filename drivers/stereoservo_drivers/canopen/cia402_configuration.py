@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import configparser
 import math
-import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, FEEDBACK_OBJECTS, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.option_checks import parse_sdo_key
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CommandMode
 from stereoservo_drivers.canopen.units import JointScale
 
@@ -35,7 +35,7 @@ TARGETS: dict[CommandMode, tuple[int, int]] = {
     "ip": (0x60C1, 1),
 }
 """Object of the set-point of each mode."""
-FEEDBACK_INDEX = {"velocity": 0x606C, "effort": 0x6077, "following_error": 0x60F4, "switches": 0x60FD}
+FEEDBACK_INDEX = {what: entry >> 16 for what, (entry, _) in FEEDBACK_OBJECTS.items()}
 HEARTBEAT_CONSUMER = (0x1016, 1)
 GUARD_TIME, LIFE_FACTOR = (0x100C, 0), (0x100D, 0)
 DEADLINE = (0x1400, 5)
@@ -121,11 +121,10 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
     if not set(watches) - {"deadline"}:
         unwatched = NO_WATCH + ONLY_DEADLINE * bool(watches)
         if "watch" not in joint.accept_missing:
-            raise DriverError(
+            raise drive.error(
                 "no_watch",
-                f"{drive.name}: {unwatched}. If this computer dies, it goes on with the last command that it got. Cut "
+                f"{unwatched}. If this computer dies, it goes on with the last command that it got. Cut "
                 'its power by a safety relay, and say that you know: accept_missing = ["watch"] of this joint',
-                node_id=drive.node_id,
                 joint=joint.name,
             )
         losses.insert(0, f"{unwatched}, as accept_missing acknowledges")
@@ -155,12 +154,7 @@ def _modes(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> tuple[
     told = "none" if has.modes is None else f"0x{has.modes:08X}"
     number = "" if options.mode == "auto" else f" {MODES[options.mode]} ({options.mode})"
     able = ", ".join(there) or "none of csv, pv, csp and ip: this drive cannot be used"
-    raise DriverError(
-        "mode",
-        f"{drive.name}: the drive has no mode{number}, 0x6502 is {told}; set mode to {able}",
-        node_id=drive.node_id,
-        modes=has.modes,
-    )
+    raise drive.error("mode", f"the drive has no mode{number}, 0x6502 is {told}; set mode to {able}", modes=has.modes)
 
 
 def usable(mode: CommandMode, has: Capabilities) -> bool:
@@ -219,8 +213,6 @@ RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
 TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
 PDO_RANGE = 0x200
 
-_OBJECT = re.compile(r"\s*(0[xX][0-9a-fA-F]{1,4})\s*(?::\s*(\d{1,3}|0[xX][0-9a-fA-F]{1,2}))?\s*")
-
 
 @dataclass(frozen=True)
 class Write:
@@ -244,25 +236,9 @@ class Write:
         return (read ^ self.value) & self.mask == 0
 
 
-def parse_object(name: str, joint: str) -> tuple[int, int]:
-    """Parse ``0x60C2:1`` as index and sub-index (0 if omitted). Raises DriverError (``option``)."""
-    match = _OBJECT.fullmatch(name)
-    if match is None or int(match[2] or "0", 0) > 0xFF:
-        raise DriverError(
-            "option",
-            f"joint {joint!r}: sdo key {name!r} is no object; write it like 0x60C2:1 (index and sub-index)",
-            joint=joint,
-            key=name,
-        )
-    return int(match[1], 16), int(match[2] or "0", 0)
-
-
 def identifier_writes(node_id: int) -> list[Write]:
     """Writes of the COB-IDs of SYNC (not produced by the drive: bit 30) and EMCY, for drives with other values."""
-    return [
-        Write(0x1005, 0, SYNC_ID, 0x400007FF),
-        Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF),
-    ]
+    return [Write(0x1005, 0, SYNC_ID, 0x400007FF), Write(0x1014, 0, EMCY_ID + node_id, 0x800007FF)]
 
 
 def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list[Write]:
@@ -278,23 +254,19 @@ def parameter_writes(options: CanOptions, joint: CanJoint, setup: Setup) -> list
         Write(0x1017, 0, 0 if guarded else options.heartbeat_ms, option="heartbeat_ms"),
         Write(*ABORT_OPTION, options.abort_option, option="abort_option"),
         Write(*QUICK_STOP_OPTION, options.quick_stop_option, option="quick_stop_option"),
-        Write(
-            *QUICK_STOP_RAMP,
-            scale.rate_units(joint.quick_stop_deceleration),
-            option="quick_stop_deceleration",
-        ),
+        Write(*QUICK_STOP_RAMP, scale.rate_units(joint.quick_stop_deceleration), option="quick_stop_deceleration"),
         Write(*FAULT_REACTION, FAULT_REACTION_QUICK_STOP),
         *(Write(*key, limit, option="max_velocity") for key in SPEEDS),
         *(Write(*key, acceleration, option="max_acceleration") for key in RAMPS),
     ]
-    own = [Write(*parse_object(name, joint.name), value, option="sdo") for name, value in joint.sdo.items()]
+    own = [Write(*parse_sdo_key(name), value, option="sdo") for name, value in joint.sdo.items()]
     there = [write for write in writes if write.key == (0x1017, 0) or setup.capabilities.has(write.key)]
     return list({write.key: write for write in (*there, *own)}.values())
 
 
 def period_writes(options: CanOptions, joint: CanJoint, setup: Setup, mode: CommandMode) -> list[Write]:
     """Writes of the period of set-points in the modes that interpolate, if the drive has the object."""
-    told = {parse_object(name, joint.name) for name in joint.sdo}
+    told = {parse_sdo_key(name) for name in joint.sdo}
     has = setup.capabilities.values
     if mode == "pv" or INTERPOLATION_TIME not in has or INTERPOLATION_TIME in told:
         return []
@@ -332,12 +304,7 @@ def unwatch_writes(setup: Setup) -> list[Write]:
 
 
 def one_pdo_writes(
-    number: int,
-    base: tuple[int, int],
-    cob_id: int,
-    mapping: tuple[int, ...],
-    transmission: int,
-    deadline_ms: int,
+    number: int, base: tuple[int, int], cob_id: int, mapping: tuple[int, ...], transmission: int, deadline_ms: int
 ) -> list[Write]:
     """Writes of one PDO in the order of CiA 301: off, no mapping, mapping, type, deadline, on."""
     communication, mapped = base[0] + number, base[1] + number
@@ -397,15 +364,7 @@ def load_eds(path: Path) -> canopen.ObjectDictionary:
 
     try:
         dictionary = import_od(str(path))
-    except (
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        NotImplementedError,
-        OSError,
-        configparser.Error,
-    ) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, NotImplementedError, OSError, configparser.Error) as error:
         raise DriverError("eds", f"{path} is not an EDS file of CiA 306: {error}", path=str(path)) from error
     if not len(dictionary):
         raise DriverError("eds", f"{path} holds no objects", path=str(path))

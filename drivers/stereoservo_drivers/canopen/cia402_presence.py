@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS
+from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SDO_REQUEST_ID, SDO_RESPONSE_ID
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.codec import Link, listening, until
 from stereoservo_drivers.canopen.options import CanOptions
@@ -42,7 +42,7 @@ class Identity:
     serial_number: int | None
 
 
-def alone(link: Link, drives: list[RemoteDrive]) -> None:
+def require_single_master(link: Link, drives: list[RemoteDrive]) -> None:
     """Check, before anything is sent, that no other master commands these drives. Raises DriverError
     (``second_master``).
     """
@@ -51,19 +51,18 @@ def alone(link: Link, drives: list[RemoteDrive]) -> None:
     for drive in drives:
         count = len(received[RPDO_IDS[0] + drive.node_id])
         if count:
-            raise DriverError(
+            raise drive.error(
                 "second_master",
-                f"{drive.name}: somebody else commands this drive, {count} frames 0x{RPDO_IDS[0] + drive.node_id:X} "
+                f"somebody else commands this drive, {count} frames 0x{RPDO_IDS[0] + drive.node_id:X} "
                 f"within {ALONE_S * 1e3:.0f} ms; end the other master (another daemon or doctor on this bus, a "
                 "maker's commissioning tool) first",
                 retry=True,
-                node_id=drive.node_id,
                 frames=count,
             )
 
 
 @contextmanager
-def unbroken(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
+def reject_reboots(link: Link, drives: list[RemoteDrive]) -> Iterator[None]:
     """Context manager that raises DriverError (``rebooted``) at its end if a drive has booted meanwhile and lost its
     configuration.
     """
@@ -81,33 +80,32 @@ def _check_boots(
 ) -> None:
     for drive in drives:
         if any(frame.data == BOOT_UP for frame in received[HEARTBEAT_ID + drive.node_id]):
-            raise DriverError(
+            raise drive.error(
                 "rebooted",
-                f"{drive.name}: booted while it was configured and has forgotten what was written; is its supply "
+                "booted while it was configured and has forgotten what was written; is its supply "
                 "sound, does another master reset it? Try again",
                 retry=True,
-                node_id=drive.node_id,
             ) from consequence
 
 
-def ask(
+def read_from_nodes(
     link: Link, nodes: list[int], index: int, subindex: int, patience_s: float = PROBE_S
 ) -> dict[int, list[CanFrame]]:
     """All replies of ``nodes`` to one SDO read each, within ``PROBE_S``; the first ones may take ``patience_s``."""
     request = bytes([0x40, index & 0xFF, index >> 8, subindex, 0, 0, 0, 0])
-    with listening(link, [0x580 + node for node in nodes]) as received:
+    with listening(link, [SDO_RESPONSE_ID + node for node in nodes]) as received:
         for node in nodes:
-            link.send([CanFrame(0x600 + node, request)])
+            link.send([CanFrame(SDO_REQUEST_ID + node, request)])
         link.wait(PROBE_S)
         if patience_s > PROBE_S and not all(received.values()):
             until(link, lambda: all(received.values()), patience_s - PROBE_S)
             link.wait(PROBE_S)
-    return {node: received[0x580 + node] for node in nodes}
+    return {node: received[SDO_RESPONSE_ID + node] for node in nodes}
 
 
-def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
+def require_nodes(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
     """One reply of each node. Raises DriverError (``node_missing``, ``duplicate_node``)."""
-    answers = ask(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
+    answers = read_from_nodes(link, [drive.node_id for drive in drives], 0x1018, 4, PATIENCE_S)
     missing = [drive for drive in drives if not answers[drive.node_id]]
     if missing:
         raise _missing(link, missing, drives, options)
@@ -118,18 +116,17 @@ def find(link: Link, drives: list[RemoteDrive], options: CanOptions) -> None:
                 "unknown" if frame.data[:1] == ABORT else f"{int.from_bytes(frame.data[4:8], 'little')}"
                 for frame in answers[drive.node_id]
             )
-            raise DriverError(
+            raise drive.error(
                 "duplicate_node",
-                f"{drive.name}: {count} nodes answer to this id (serial numbers {serials}); disconnect all but one "
+                f"{count} nodes answer to this id (serial numbers {serials}); disconnect all but one "
                 "and give each an id of its own",
-                node_id=drive.node_id,
                 answers=count,
             )
 
 
 def _missing(link: Link, missing: list[RemoteDrive], drives: list[RemoteDrive], options: CanOptions) -> DriverError:
     configured = [drive.node_id for drive in drives]
-    others = ask(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
+    others = read_from_nodes(link, [node for node in ALL_NODES if node not in configured], 0x1000, 0)
     absent = [drive.node_id for drive in missing]
     present = sorted({*configured} - {*absent} | {node for node, answers in others.items() if answers})
     names = ", ".join(drive.name for drive in missing)
@@ -153,22 +150,20 @@ def identify(drive: RemoteDrive, eds: Path) -> Identity:
     """Check the drive's type and identity. Raises DriverError (``not_a_drive``, ``identity``, ``wrong_eds``)."""
     device_type = drive.read(0x1000)
     if device_type & 0xFFFF != CIA_402:
-        raise DriverError(
+        raise drive.error(
             "not_a_drive",
-            f"{drive.name}: device type is 0x{device_type:08X} (profile {device_type & 0xFFFF}), not a drive "
+            f"device type is 0x{device_type:08X} (profile {device_type & 0xFFFF}), not a drive "
             f"(profile {CIA_402}); is node_id right?",
-            node_id=drive.node_id,
             device_type=device_type,
         )
     identity = Identity(*(drive.read_if_there(0x1018, subindex) for subindex in (1, 2, 3, 4)))
     for key in IDENTITY:
         expected, found = getattr(drive.axis.joint, key), getattr(identity, key)
         if expected is not None and expected != found:
-            raise DriverError(
+            raise drive.error(
                 "identity",
-                f"{drive.name}: {key} is {_number(found)}, the cell file says {_number(expected)}; was the drive "
+                f"{key} is {_number(found)}, the cell file says {_number(expected)}; was the drive "
                 "exchanged, or are node ids swapped?",
-                node_id=drive.node_id,
                 key=key,
                 found=found,
                 wanted=expected,
@@ -191,11 +186,10 @@ def _check_eds(drive: RemoteDrive, identity: Identity, eds: Path) -> None:
         ("product", of.product_number, identity.product_code),
     ):
         if in_eds and found is not None and in_eds != found:
-            raise DriverError(
+            raise drive.error(
                 "wrong_eds",
-                f"{drive.name}: {eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "
+                f"{eds.name} is for {key} 0x{in_eds:X} ({of.vendor_name} {of.product_name}), "
                 f"the drive is {key} 0x{found:X}; take the drive's own EDS, or leave eds out",
-                node_id=drive.node_id,
                 eds=str(eds),
                 in_eds=in_eds,
                 found=found,

@@ -7,8 +7,9 @@ no receiving thread and no exception is lost in its callbacks.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterable
 from types import TracebackType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import canopen
 from canopen.nmt import NMT_COMMANDS, NmtMaster
@@ -19,19 +20,15 @@ from canopen.sdo.client import ReadableStream, WritableStream
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import DriveAxis
-from stereoservo_drivers.canopen.cia402_words import (
-    ABORT_NO_OBJECT,
-    ABORT_NO_SUBINDEX,
-    abort_hint,
-    abort_words,
-)
+from stereoservo_drivers.canopen.cia402 import SDO_REQUEST_ID, SDO_RESPONSE_ID, DriveAxis
+from stereoservo_drivers.canopen.cia402_words import ABORT_NO_OBJECT, ABORT_NO_SUBINDEX, abort_hint, abort_words
 from stereoservo_drivers.canopen.codec import Link
+
+if TYPE_CHECKING:
+    from stereoservo_drivers.canopen.cia402_configuration import Write
 
 logging.getLogger("canopen").addHandler(logging.NullHandler())
 
-SDO_REQUEST_ID = 0x600
-SDO_RESPONSE_ID = 0x580
 SDO_TIMEOUT_S = 0.5
 LOOK_S = 0.0002
 """Interval of checks for an awaited frame [s]."""
@@ -113,6 +110,10 @@ class RemoteDrive:
     ) -> None:
         self._link.unsubscribe(self._client.tx_cobid, self._client.heard)
 
+    def error(self, code: str, message: str, *, retry: bool = False, **data: Any) -> DriverError:
+        """An error of this drive, whose name precedes the ``message``."""
+        return DriverError(code, f"{self.name}: {message}", retry=retry, node_id=self.node_id, **data)
+
     def nmt(self, command: str) -> None:
         """Send an NMT command of CiA 301 by name: ``OPERATIONAL``, ``PRE-OPERATIONAL``, ``RESET COMMUNICATION``."""
         self._nmt.send_command(NMT_COMMANDS[command])
@@ -187,6 +188,11 @@ class RemoteDrive:
             WritableStream(self._client, index, subindex, size).write(value.to_bytes(size, "little", signed=signed))
         except (SdoAbortedError, SdoCommunicationError) as error:
             raise self._failed("writing", index, subindex, value, error, option) from error
+
+    def write_all(self, writes: Iterable[Write]) -> None:
+        """Write objects in order. Raises DriverError, as ``write``."""
+        for write in writes:
+            self.write(write.index, write.subindex, write.value, write.option)
 
     def _data(self, index: int, subindex: int, value: int | None) -> dict[str, Any]:
         return {

@@ -43,12 +43,7 @@ _STATES = tuple(_state_of(low_bits) for low_bits in range(128))
 
 FAULTY = frozenset({DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE})
 POWER_OFF = frozenset(
-    {
-        DriveState.NOT_READY_TO_SWITCH_ON,
-        DriveState.SWITCH_ON_DISABLED,
-        DriveState.READY_TO_SWITCH_ON,
-        DriveState.FAULT,
-    }
+    {DriveState.NOT_READY_TO_SWITCH_ON, DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON, DriveState.FAULT}
 )
 """States in which no torque can be applied to the motor."""
 
@@ -172,33 +167,18 @@ ERROR_CODES: dict[int, tuple[str, str]] = {
     0x8210: ("PDO not processed: too short", _MAPPING),
     0x8220: ("PDO longer than mapped", _MAPPING),
     0x8230: ("destination object of a multiplexed PDO not available", _MAPPING),
-    0x8240: (
-        "SYNC of an unexpected length",
-        "another SYNC producer is on the bus: switch it off (0x1005, bit 30)",
-    ),
-    0x8250: (
-        "RPDO timed out",
-        "the cycle did not reach the drive within rpdo_deadline_ms; see the fault before it",
-    ),
+    0x8240: ("SYNC of an unexpected length", "another SYNC producer is on the bus: switch it off (0x1005, bit 30)"),
+    0x8250: ("RPDO timed out", "the cycle did not reach the drive within rpdo_deadline_ms; see the fault before it"),
     0x8300: ("torque control", "check tuning and load"),
     0x8311: ("excess torque", "free the joint; lower max_acceleration or the load"),
     0x8312: ("difficult start-up", "free the joint; see whether its brake opens"),
     0x8321: ("insufficient torque", "check load and rated torque"),
-    0x8400: (
-        "velocity speed controller",
-        "check tuning, and that the encoder counts with the motor's direction",
-    ),
+    0x8400: ("velocity speed controller", "check tuning, and that the encoder counts with the motor's direction"),
     0x8500: ("position controller", "check tuning"),
     0x8600: ("positioning controller", "check tuning"),
-    0x8611: (
-        "following error",
-        "free the joint; lower max_acceleration; check the drive's tuning and 0x6065",
-    ),
+    0x8611: ("following error", "free the joint; lower max_acceleration; check the drive's tuning and 0x6065"),
     0x8612: ("reference limit", "drive the joint back by hand or with the drive's own tool"),
-    0x8700: (
-        "SYNC lost or out of time",
-        "see the fault before it; 0x1006 is the period that the drive expects",
-    ),
+    0x8700: ("SYNC lost or out of time", "see the fault before it; 0x1006 is the period that the drive expects"),
     0x9000: ("external error", "see the drive's digital inputs"),
     0xF001: ("deceleration", _SETTINGS),
     0xF002: ("sub-synchronous run", _SETTINGS),
@@ -282,10 +262,7 @@ ABORT_CODES: dict[int, tuple[str, str]] = {
     0x060A0023: ("resource not available", "power the drive off and on"),
     0x08000000: ("general error", "look at the drive's own error"),
     0x08000020: ("data cannot be transferred or stored", _STATE),
-    0x08000021: (
-        "data cannot be stored because of local control",
-        "end the drive's local control (its own tool)",
-    ),
+    0x08000021: ("data cannot be stored because of local control", "end the drive's local control (its own tool)"),
     0x08000022: ("data cannot be stored in the present device state", _STATE),
     0x08000023: ("no object dictionary present", "power the drive off and on"),
     0x08000024: ("no data available", _STATE),

@@ -35,8 +35,7 @@ from stereoservo_drivers.canopen.cia402_bringup import Cia402Bringup
 from stereoservo_drivers.canopen.codec import Bringup, Codec
 from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.master import ENABLE_LIMIT_S, Master, MasterFault, MasterSettings, Mode
-from stereoservo_drivers.canopen.odrive import OdriveCodec
-from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
+from stereoservo_drivers.canopen.odrive import OdriveBringup, OdriveCodec
 from stereoservo_drivers.canopen.option_checks import check_options
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, can_options
 from stereoservo_drivers.kit.auxiliary import verify_order
@@ -49,10 +48,7 @@ OFF_MARGIN_S = 1.0
 SWITCH_INTERVAL_S = 0.0005
 """Python's switch interval [s]: another thread of the process may compute this long before the bus thread continues."""
 _POLL_S = 0.001
-_LOADS: dict[Literal["efforts", "following_errors"], str] = {
-    "efforts": "effort",
-    "following_errors": "following_error",
-}
+_LOADS: dict[Literal["efforts", "following_errors"], str] = {"efforts": "effort", "following_errors": "following_error"}
 """Names required in ``feedback`` for a sample to contain the values."""
 
 
@@ -167,7 +163,7 @@ class CanJointDriver:
     def _await_rest(self) -> None:
         """Wait for the end of the quick stop before the cycle ends. Raises DriverError if the arm keeps moving."""
         limit_s = self.master.stop_limit_s
-        if self._wait(lambda: self.master.stands() is True, limit_s) or self.master.stands() is None:
+        if self._wait(lambda: self.master.at_rest() is True, limit_s) or self.master.at_rest() is None:
             return
         sample = self.master.sample()
         speeds = [] if sample is None else np.round(sample.velocities, 4).tolist()
@@ -211,8 +207,7 @@ class CanJointDriver:
         if not self._wait(self._is_off, limit_s):
             states = ", ".join(self._codec.status_words())
             raise DriverError(
-                "not_off",
-                f"the drives are not off {limit_s:.1f} s after they were told to be; they say: {states}",
+                "not_off", f"the drives are not off {limit_s:.1f} s after they were told to be; they say: {states}"
             )
 
     def _is_off(self) -> bool:
@@ -233,7 +228,7 @@ class CanJointDriver:
             self.master.latch(MasterFault(error.code, str(error)))
         bus = self.bus
         if bus is not None and bus.alive:
-            self._wait(lambda: self.master.stands() is True, self.master.stop_limit_s)
+            self._wait(lambda: self.master.at_rest() is True, self.master.stop_limit_s)
             try:
                 bus.end_cycle()
                 self.bringup.release(bus)
@@ -295,8 +290,7 @@ class CanJointDriver:
         asked = np.array(qd, dtype=np.float64)
         if asked.shape != (len(self.options.joint),):
             raise DriverError(
-                "shape",
-                f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)",
+                "shape", f"write_velocity() got shape {asked.shape}; this arm takes ({len(self.options.joint)},)"
             )
         if not np.isfinite(asked).all():
             raise DriverError("not_finite", f"write_velocity() got {asked.tolist()}; velocities must be finite")

@@ -21,7 +21,7 @@ from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, 
 from stereoservo_drivers.canopen.codec import Bringup, listening
 from stereoservo_drivers.canopen.master import Master
 from stereoservo_drivers.canopen.nodes import examine_nodes, other_bitrate, scan
-from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
+from stereoservo_drivers.canopen.odrive import OdriveBringup
 from stereoservo_drivers.canopen.option_checks import bus_load
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_drivers.canopen.units import JointScale
@@ -194,10 +194,7 @@ def cycles_finding(cycles: int, missed: int, skipped: int) -> ExaminationFinding
         return ExaminationFinding("cycle", True, message)
     if skipped > MISSED_SHARE * cycles:
         return ExaminationFinding(
-            "cycle",
-            None,
-            message,
-            "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz",
+            "cycle", None, message, "SCHED_FIFO for the daemon (limit rtprio), fewer other programs, lower rate_hz"
         )
     remedy = "cable, terminators, adapter; lower rate_hz; max_missed_cycles allows single ones"
     return ExaminationFinding("cycle", None if missed <= MISSED_SHARE * cycles else False, message, remedy)

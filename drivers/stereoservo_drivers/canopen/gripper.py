@@ -14,16 +14,8 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import (
-    EMCY_ID,
-    HEARTBEAT_ID,
-    RPDO_IDS,
-    STATUS_AND_POSITION,
-    TPDO_IDS,
-    DriveAxis,
-)
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, RPDO_IDS, STATUS_AND_POSITION, TPDO_IDS, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
     AT_ONCE,
     CONTROL_WORD,
@@ -105,11 +97,10 @@ class Gripper:
         """The safest configuration of its drive. Raises DriverError (``mode``)."""
         if (has.modes is not None and not has.modes & 1 << PROFILE_POSITION - 1) or not has.has(TARGET_POSITION):
             told = "not told" if has.modes is None else f"0x{has.modes:08X}"
-            raise DriverError(
+            raise drive.error(
                 "mode",
-                f"{drive.name}: a gripper's drive needs profile position (mode 1, 0x607A), 0x6502 is {told}; use "
+                f"a gripper's drive needs profile position (mode 1, 0x607A), 0x6502 is {told}; use "
                 "another drive, or a gripper on a digital output ([[joints.options.output]])",
-                node_id=drive.node_id,
                 modes=has.modes,
             )
         losses = tuple(text for key, text in LOSSES.items() if not has.has(key))
@@ -128,7 +119,7 @@ class Gripper:
             writes.append(Write(*TORQUE_LIMIT, self.gripper.torque_limit, option="torque_limit"))
         return writes
 
-    def take_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
+    def set_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
         """Write mode and PDOs; returns the writes to read back. Raises DriverError."""
         rpdo, tpdo = (RPDO_COMMUNICATION, RPDO_MAPPING), (TPDO_COMMUNICATION, TPDO_MAPPING)
         node, target = drive.node_id, TARGET_POSITION[0] << 16 | 32
@@ -139,8 +130,7 @@ class Gripper:
         ]
         drive.write(0x6060, 0, PROFILE_POSITION, "mode")
         until(link, lambda: drive.read(0x6061) == PROFILE_POSITION, MODE_S)
-        for write in pdos:
-            drive.write(write.index, write.subindex, write.value, write.option)
+        drive.write_all(pdos)
         return [Write(0x6061, 0, PROFILE_POSITION, option="mode"), *pdos]
 
     def listen(self, link: Link) -> None:
@@ -206,7 +196,7 @@ class Gripper:
         while self._emergencies:
             data = self._emergencies.pop(0).data
             code = int.from_bytes(data[:2], "little")
-            self.axis.take_code(code)
+            self.axis.add_error_code(code)
             if code and code not in self._options.emcy_ignore:
                 found = self._fault("emergency", error_words(code), code, error_hint(code))
         while self._heartbeats:
@@ -227,13 +217,10 @@ class Gripper:
         self._statuses.clear()
         if len(newest) != _WORD_AND_POSITION.size:
             return self._fault(
-                "mapping",
-                f"TPDO1 has {len(newest)} bytes, {_WORD_AND_POSITION.size} are mapped",
-                len(newest),
-                "reset",
+                "mapping", f"TPDO1 has {len(newest)} bytes, {_WORD_AND_POSITION.size} are mapped", len(newest), "reset"
             )
         word, counts = _WORD_AND_POSITION.unpack(newest)
-        self.axis.take_status(word)
+        self.axis.set_status_word(word)
         self._position = self.axis.scale.position(self.axis.counts.update(counts))
         self._status_ns = now_ns
         if self.axis.faulty:
@@ -280,10 +267,7 @@ class Gripper:
         ):
             if now_ns - heard_ns > self._silent_ns:
                 return self._fault(
-                    code,
-                    f"no {what} for {self._silent_ns * 1e-6:.0f} ms",
-                    None,
-                    "check its supply and the bus cable",
+                    code, f"no {what} for {self._silent_ns * 1e-6:.0f} ms", None, "check its supply and the bus cable"
                 )
         waited_s = (now_ns - self._since_ns) * 1e-9
         if self._on and not self._was_enabled and waited_s > ENABLE_LIMIT_S:

@@ -30,7 +30,7 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     lead_words,
     load_eds,
 )
-from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, ask
+from stereoservo_drivers.canopen.cia402_presence import ALL_NODES, CIA_402, IDENTITY, read_from_nodes
 from stereoservo_drivers.canopen.cia402_sdo import RemoteDrive
 from stereoservo_drivers.canopen.cia402_words import FAULTY, drive_state, error_hint, error_words
 from stereoservo_drivers.canopen.codec import Link, Subscriptions
@@ -44,7 +44,7 @@ BITRATES = (1_000_000, 500_000, 250_000, 125_000, 800_000, 100_000, 50_000, 20_0
 """Bit rates of CiA 301 [bit/s], the commonest first."""
 NOT_HARDWARE = ("virtual", "udp_multicast", "slcan", "serial", "seeedstudio")
 """Interfaces that need no adapter, or accept any serial port as theirs."""
-HARDLY_LIMITS = 2**31 - 2**16
+UNLIMITED_COUNTS = 2**31 - 2**16
 """[counts] Limits at least as wide as the counter limit nothing."""
 ENCODER, TURNS = (0x608F, 1), (0x608F, 2)
 POSITION_LIMITS = ((0x607D, 1), (0x607D, 2))
@@ -75,8 +75,7 @@ def found_buses(
         if port.vid is not None:
             found.append(
                 FoundBus(
-                    f"serial port {port.device} ({port.description})",
-                    {"interface": SLCAN, "channel": port.device},
+                    f"serial port {port.device} ({port.description})", {"interface": SLCAN, "channel": port.device}
                 )
             )
     return tuple(found)
@@ -262,7 +261,7 @@ def _asked(link: ScanLink, node: int) -> FoundDrive | ExaminationFinding:
 
 def stated_limits(low: int | None, high: int | None) -> tuple[int, int] | None:
     """Software position limits [counts] in 0x607D; None if they limit nothing."""
-    if low is None or high is None or low >= high or (low <= -HARDLY_LIMITS and high >= HARDLY_LIMITS):
+    if low is None or high is None or low >= high or (low <= -UNLIMITED_COUNTS and high >= UNLIMITED_COUNTS):
         return None
     return low, high
 
@@ -350,7 +349,7 @@ def _gripper(drive: RemoteDrive, gripper: Gripper) -> ExaminationFinding:
 
 def scan(link: Link) -> dict[int, int]:
     """Query every node id for its device type; returns the number of replies from each that replied."""
-    answers = ask(link, list(ALL_NODES), 0x1000, 0)
+    answers = read_from_nodes(link, list(ALL_NODES), 0x1000, 0)
     return {node: len(frames) for node, frames in answers.items() if frames}
 
 

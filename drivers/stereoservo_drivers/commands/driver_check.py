@@ -74,8 +74,7 @@ def driver_check(
     cell: Annotated[
         Path | None,
         typer.Option(
-            metavar="CELL.toml",
-            help="Take driver and options of this cell's [joints], and its safety.joint_timeout_s.",
+            metavar="CELL.toml", help="Take driver and options of this cell's [joints], and its safety.joint_timeout_s."
         ),
     ] = None,
     hardware: Annotated[
@@ -196,11 +195,7 @@ def _report(driver: str, results: list[CheckResult], as_json: bool) -> None:
     summary = ", ".join(f"{counts[verdict]} {verdict}" for verdict in ("passed", "failed", "not run"))
     failed = [result.name for result in results if result.verdict == "failed"]
     if as_json:
-        tree: dict[str, Any] = {
-            "driver": driver,
-            "checks": msgspec.to_builtins(results),
-            "summary": dict(counts),
-        }
+        tree: dict[str, Any] = {"driver": driver, "checks": msgspec.to_builtins(results), "summary": dict(counts)}
         if failed:
             tree["error"] = {"code": "checks_failed", "message": "; ".join(failed)}
         print(json.dumps(tree, allow_nan=False))

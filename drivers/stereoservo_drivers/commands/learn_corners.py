@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -29,7 +29,7 @@ from stereoservo_drivers.detectors.landmarks import KINDS, encode_landmarks
 SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 PATIENCE_S = 10.0
 LARGEST_PICTURE = 256 << 20
-Sights = dict[str, list[ImageArray]]
+CameraImages = dict[str, list[ImageArray]]
 
 
 class LearnError(Exception):
@@ -40,71 +40,74 @@ class LearnError(Exception):
         self.code = code
 
 
-def learn_corners(
-    cell: Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell file: names of its cameras.")],
-    out: Annotated[Path, typer.Argument(metavar="OUT.npz", help="File to write.")],
+@dataclass(frozen=True)
+class LearnOptions:
+    """Options of the command; each field is one of the command line."""
+
+    cell: Annotated[Path, typer.Argument(metavar="CELL.toml", help="The cell file: names of its cameras.")]
+    out: Annotated[Path, typer.Argument(metavar="OUT.npz", help="File to write.")]
     images: Annotated[
-        Path | None,
-        typer.Option(help="Folder with CAMERA.png, CAMERA_*.png (averaged) or CAMERA.avi of each camera."),
-    ] = None,
+        Path | None, typer.Option(help="Folder with CAMERA.png, CAMERA_*.png (averaged) or CAMERA.avi of each camera.")
+    ] = None
     pair: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="LEFT RIGHT", help="Images of the first two cameras of the cell file, in its order."),
-    ] = None,
+    ] = None
     moved: Annotated[
         tuple[Path, Path] | None,
         typer.Option(metavar="LEFT RIGHT", help="The same after the last joint alone has moved."),
-    ] = None,
+    ] = None
     moved_images: Annotated[
         Path | None, typer.Option(help="A folder as --images, after the last joint alone has moved.")
-    ] = None,
+    ] = None
     ask_to_move: Annotated[
-        bool,
-        typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again."),
-    ] = False,
-    frames: Annotated[int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")] = 8,
-    most: Annotated[int, typer.Option(min=16, max=2000, help="Landmarks to keep.")] = 150,
+        bool, typer.Option("--ask-to-move", help="With the cell's cameras: wait for a motion, then look again.")
+    ] = False
+    frames: Annotated[int, typer.Option(min=1, max=200, help="Frames of a camera or recording to average.")] = 8
+    most: Annotated[int, typer.Option(min=16, max=2000, help="Landmarks to keep.")] = 150
     picture: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Draw what was matched, and of which kind it is.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
-) -> None:
+    ] = None
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False
+
+
+def learn_corners(given: LearnOptions) -> None:
     """Learn landmarks from images of one moment, or of a scene at rest; a second set separates tool from scene."""
-    if images is not None and pair is not None:
+    if given.images is not None and given.pair is not None:
         raise LearnError("argument", "--images and --pair are two ways to give the images; give one of them")
-    if moved is not None and moved_images is not None:
+    if given.moved is not None and given.moved_images is not None:
         raise LearnError("argument", "--moved and --moved-images are two ways to say the same; give one of them")
-    if ask_to_move and (images is not None or pair is not None):
+    if given.ask_to_move and (given.images is not None or given.pair is not None):
         raise LearnError("argument", "--ask-to-move is for live cameras; files go with --moved or --moved-images")
-    for file in (out,) if picture is None else (out, picture):
-        if file.exists() and not force:
+    for file in (given.out,) if given.picture is None else (given.out, given.picture):
+        if file.exists() and not given.force:
             raise LearnError("exists", f"{file} exists; --force writes over it")
         if not file.absolute().parent.is_dir():
             raise LearnError("argument", f"{file}: there is no folder {file.parent} to write it into")
-    if picture is not None and picture.suffix.lower() not in SUFFIXES:
-        raise LearnError("argument", f"--picture {picture}: one of {', '.join(SUFFIXES)} is valid")
-    section = load_cell_file(cell)
-    before, after = _observations(section, cell, images, pair, frames, ask_to_move)
-    if moved is not None:
-        after = _pair(section, moved, "--moved")
-    elif moved_images is not None:
-        after = _folder(section, moved_images, frames)
-    landmarks, report = learn_landmarks(before, after, LearningSettings(most=most))
-    _write(out, encode_landmarks(landmarks))
-    if picture is not None:
-        _write_picture(picture, draw_landmarks(landmarks))
+    if given.picture is not None and given.picture.suffix.lower() not in SUFFIXES:
+        raise LearnError("argument", f"--picture {given.picture}: one of {', '.join(SUFFIXES)} is valid")
+    section = load_cell_file(given.cell)
+    before, after = _observations(section, given.cell, given.images, given.pair, given.frames, given.ask_to_move)
+    if given.moved is not None:
+        after = _pair(section, given.moved, "--moved")
+    elif given.moved_images is not None:
+        after = _folder(section, given.moved_images, given.frames)
+    landmarks, report = learn_landmarks(before, after, LearningSettings(most=given.most))
+    _write(given.out, encode_landmarks(landmarks))
+    if given.picture is not None:
+        _write_picture(given.picture, draw_landmarks(landmarks))
     kinds = {kind: landmarks.of_kind(kind).tolist() for kind in KINDS}
     answer: dict[str, Any] = {
-        "file": str(out),
+        "file": str(given.out),
         "landmarks": len(landmarks.ids),
         **{kind: len(ids) for kind, ids in kinds.items()},
         "ids": kinds,
         "left_out": report.left_out,
-        "pairs": [asdict(pair) for pair in report.pairs],
-        "picture": None if picture is None else str(picture),
+        "pairs": [asdict(one) for one in report.pairs],
+        "picture": None if given.picture is None else str(given.picture),
     }
-    if as_json:
+    if given.as_json:
         print(json.dumps(answer, allow_nan=False))
     else:
         print("\n".join(_text(answer)))
@@ -133,7 +136,7 @@ def _text(answer: Mapping[str, Any]) -> list[str]:
 
 def _observations(
     cell: CellFile, path: Path, images: Path | None, pair: tuple[Path, Path] | None, frames: int, ask: bool
-) -> tuple[Sights, Sights | None]:
+) -> tuple[CameraImages, CameraImages | None]:
     """Images before a motion and, for live cameras if ``ask`` is set, after it."""
     if images is not None:
         return _folder(cell, images, frames), None
@@ -142,8 +145,7 @@ def _observations(
     running = daemon_info(cell_directories(cell.cell.name))
     if running is not None:
         raise LearnError(
-            "running",
-            f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images",
+            "running", f"cell {cell.cell.name!r} is live and has its cameras; end its daemon, or give --images"
         )
     before = _take_frames(cell, path, frames)
     if not ask:
@@ -154,16 +156,16 @@ def _observations(
     return before, _take_frames(cell, path, frames)
 
 
-def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> Sights:
+def _pair(cell: CellFile, files: tuple[Path, Path], option: str) -> CameraImages:
     if len(cell.camera) < 2:
         raise LearnError("argument", f"{option}: the cell file has {len(cell.camera)} camera; two are needed")
     return {camera.name: [_read(file)] for camera, file in zip(cell.camera, files, strict=False)}
 
 
-def _folder(cell: CellFile, folder: Path, frames: int) -> Sights:
+def _folder(cell: CellFile, folder: Path, frames: int) -> CameraImages:
     if not folder.is_dir():
         raise LearnError("images", f"{folder} is no folder")
-    views: Sights = {}
+    views: CameraImages = {}
     for camera in cell.camera:
         stills = sorted(
             file
@@ -197,10 +199,10 @@ def _read(file: Path) -> ImageArray:
     return np.asarray(image, dtype=np.uint8)
 
 
-def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
+def _take_frames(cell: CellFile, path: Path, frames: int) -> CameraImages:
     """Frames of the cell's own cameras, through their drivers. Raises DriverError, PluginError."""
     opened: dict[str, CameraDriver] = {}
-    views: Sights = {camera.name: [] for camera in cell.camera}
+    views: CameraImages = {camera.name: [] for camera in cell.camera}
     try:
         for camera in cell.camera:
             context = DriverContext(
@@ -219,8 +221,7 @@ def _take_frames(cell: CellFile, path: Path, frames: int) -> Sights:
         while short := [name for name, seen in views.items() if len(seen) < frames]:
             if time.monotonic() > until:
                 raise DriverError(
-                    "silent",
-                    f"camera {short[0]!r} gave {len(views[short[0]])} of {frames} frames in {PATIENCE_S:g} s",
+                    "silent", f"camera {short[0]!r} gave {len(views[short[0]])} of {frames} frames in {PATIENCE_S:g} s"
                 )
             for name in short:
                 _take(name, opened[name].poll(), views[name], frames)

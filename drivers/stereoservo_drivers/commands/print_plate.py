@@ -50,10 +50,7 @@ def print_plate(
         dots = DotPlates(faces_named("a,b" if faces is None else faces), dot_mm, spacing, _polarity(polarity))
         plates += dots.plates()
         lines += dots.cell_lines()
-        below += [
-            f"dots of {2 * dots.millimetres[0].radius:g} mm: {dots.dot_px_range}",
-            *_short(dots.cell_lines()),
-        ]
+        below += [f"dots of {2 * dots.millimetres[0].radius:g} mm: {dots.dot_px_range}", *_short(dots.cell_lines())]
         answer["faces"] = [
             {"name": f.name, "ids": list(f.ids), "dot_mm": 2 * f.radius, "side_mm": 2 * f.half_side}
             for f in dots.millimetres
@@ -187,9 +184,7 @@ def write_pages(pages: Sequence[Page], path: Path, *, force: bool = False) -> li
     there = [str(one) for one in paths if one.exists()]
     if there and not force:
         raise PlateError(
-            "exists",
-            f"{', '.join(there)}: exists already; another name, or --force to write over it",
-            path=there,
+            "exists", f"{', '.join(there)}: exists already; another name, or --force to write over it", path=there
         )
     if kind == ".pdf":
         _replace(path, lambda part: write_pdf(pages, part))
@@ -208,9 +203,7 @@ def _replace(path: Path, write: Callable[[Path], object]) -> None:
         os.replace(part, path)
     except OSError as error:
         raise PlateError(
-            "file",
-            f"{path}: {error.strerror}; give a file in a folder that can be written to",
-            path=str(path),
+            "file", f"{path}: {error.strerror}; give a file in a folder that can be written to", path=str(path)
         ) from error
     finally:
         with contextlib.suppress(OSError):
@@ -424,9 +417,7 @@ class TagPlates:
         """The plates to cut out, a white cell about each tag. Raises PlateError ``tag_size``."""
         if not LEAST_TAG_MM <= self.tag_mm < np.inf:
             raise PlateError(
-                "tag_size",
-                f"tags of {self.tag_mm:g} mm; valid: {LEAST_TAG_MM:g} mm and more",
-                tag_mm=self.tag_mm,
+                "tag_size", f"tags of {self.tag_mm:g} mm; valid: {LEAST_TAG_MM:g} mm and more", tag_mm=self.tag_mm
             )
         cell = self.tag_mm / cells_along(self.dictionary)
         found = []
@@ -512,10 +503,7 @@ def lay_out(plates: Sequence[Plate], paper: tuple[float, float], below: Sequence
     """
     width, height = paper
     footer = BAR + LINE * len(below)
-    space = (
-        width - 2 * BORDER - 2 * (MARK + CLEARANCE),
-        height - 2 * BORDER - HEADER - footer - MARK - CLEARANCE,
-    )
+    space = (width - 2 * BORDER - 2 * (MARK + CLEARANCE), height - 2 * BORDER - HEADER - footer - MARK - CLEARANCE)
     pages, rest = [], list(plates)
     while rest:
         first = rest[0]
@@ -547,11 +535,7 @@ def _page(plates: Sequence[Plate], across: int, gap: float, paper: tuple[float, 
     top = BORDER + HEADER
     shapes: list[Disc | Box | Line | Text] = [
         Text(BORDER, BORDER + 4.0, f"stereoservo: {title}", 3.6),
-        Text(
-            BORDER,
-            BORDER + 8.0,
-            "this side up ^  not mirrored: if you can read this, it is right; print at 100 %",
-        ),
+        Text(BORDER, BORDER + 8.0, "this side up ^  not mirrored: if you can read this, it is right; print at 100 %"),
     ]
     for k, plate in enumerate(plates):
         x, y = left + (k % across) * (side + gap), top + (k // across) * (side + gap)

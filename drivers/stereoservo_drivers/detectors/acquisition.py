@@ -224,11 +224,7 @@ def compile_kernels() -> None:
     """Compile the kernels that the detector calls, or load them from the cache."""
     compile_for(noise_level, IMAGE)
     compile_for(
-        _spots,
-        fields(IMAGE, BOOL),
-        fields(given(BYTE, 1), given(WORD, 1), INT, INT),
-        fields(INT, FLOAT, INT),
-        SCRATCH,
+        _spots, fields(IMAGE, BOOL), fields(given(BYTE, 1), given(WORD, 1), INT, INT), fields(INT, FLOAT, INT), SCRATCH
     )
 
 
@@ -314,10 +310,7 @@ def copies_of(
     """All occurrences (k, 7) of each face of ``sought`` (f,) among ``spots`` (m, FIELDS): rows of the spots, -1 for
     missing dots.
     """
-    owners, counts = (
-        np.empty((len(faces.radii), MOST_COPIES, 7), np.int64),
-        np.empty(len(faces.radii), np.int64),
-    )
+    owners, counts = (np.empty((len(faces.radii), MOST_COPIES, 7), np.int64), np.empty(len(faces.radii), np.int64))
     find_faces(plain(faces), sought, spots, (least, REACH_PX, tolerance), owners, counts)
     return [found[:count] for found, count in zip(owners, counts.tolist(), strict=True)]
 

@@ -16,14 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo.ports.devices import (
-    CameraObservation,
-    DetectorDescription,
-    DriverContext,
-    DriverError,
-    Frame,
-    Prior,
-)
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.detectors import tag_registration
 from stereoservo_drivers.detectors.acquisition import noise_level
 from stereoservo_drivers.detectors.tag_registration import (
@@ -194,12 +187,7 @@ class TagDetector:
         return found
 
     def _search_window(
-        self,
-        image: ImageArray,
-        window: ImageArray,
-        origin: FloatArray,
-        tag: int,
-        places: tuple[FloatArray, FloatArray],
+        self, image: ImageArray, window: ImageArray, origin: FloatArray, tag: int, places: tuple[FloatArray, FloatArray]
     ) -> _Found | None:
         """Search for ``tag`` in a window of the image."""
         if min(window.shape) < SMALLEST_IMAGE:
@@ -208,10 +196,7 @@ class TagDetector:
         return self._chosen(image, tag, [quad + origin for quad in quads], places)
 
     def _search(
-        self,
-        image: ImageArray,
-        tags: Iterable[int],
-        expected: Mapping[int, tuple[FloatArray, FloatArray]],
+        self, image: ImageArray, tags: Iterable[int], expected: Mapping[int, tuple[FloatArray, FloatArray]]
     ) -> dict[int, _Found]:
         """Search for ``tags`` in the whole image: with one threshold, and with all of them unless each is found."""
         wanted = set(tags)
@@ -240,11 +225,7 @@ class TagDetector:
         return quads
 
     def _chosen(
-        self,
-        image: ImageArray,
-        tag: int,
-        quads: Iterable[FloatArray],
-        places: tuple[FloatArray, FloatArray] | None,
+        self, image: ImageArray, tag: int, quads: Iterable[FloatArray], places: tuple[FloatArray, FloatArray] | None
     ) -> _Found | None:
         """The tag among ``quads``: the only one, or the one at the prior's ``places``; else None."""
         finds: list[_Found] = []

@@ -18,14 +18,7 @@ import numpy as np
 from msgspec import Meta
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
-from stereoservo.ports.devices import (
-    CameraObservation,
-    DetectorDescription,
-    DriverContext,
-    DriverError,
-    Frame,
-    Prior,
-)
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.detectors.landmark_search import (
     Keypoints,
     Surroundings,
@@ -36,12 +29,7 @@ from stereoservo_drivers.detectors.landmark_search import (
     take_better,
 )
 from stereoservo_drivers.detectors.landmarks import KINDS, load_landmarks
-from stereoservo_drivers.detectors.patch_alignment import (
-    Alignment,
-    ReferencePatches,
-    build_pyramid,
-    compile_kernels,
-)
+from stereoservo_drivers.detectors.patch_alignment import Alignment, ReferencePatches, build_pyramid, compile_kernels
 from stereoservo_drivers.frame_images import gray_image
 from stereoservo_drivers.options import decode_options
 
@@ -310,9 +298,7 @@ class CornerDetector:
         rows, result = np.flatnonzero(missing), nothing(len(self._ids))
         start = np.tile(np.eye(2), (len(rows), 1, 1))
         take_better(
-            result,
-            rows,
-            *seek(self._patches, pyramid, rows, start, self._patches.pixels[rows], self._least, 0),
+            result, rows, *seek(self._patches, pyramid, rows, start, self._patches.pixels[rows], self._least, 0)
         )
         return result
 

@@ -16,14 +16,7 @@ from msgspec import Meta
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray, IntArray
 from stereoservo.numerics.compilation import kernel, plain
-from stereoservo.ports.devices import (
-    CameraObservation,
-    DetectorDescription,
-    DriverContext,
-    DriverError,
-    Frame,
-    Prior,
-)
+from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
 from stereoservo.ports.dot_plates import CORNERS, DEFAULT_BODY, FACES, DotFace
 from stereoservo_drivers.detectors import acquisition, centroids, patterns
 from stereoservo_drivers.detectors.acquisition import Expectation, find_spots
@@ -286,12 +279,7 @@ class DotDetector:
     def _observation(self, frame: Frame, found: _Found, seen: _Seen) -> CameraObservation:
         dots, used = found
         count = report(
-            self._every_id,
-            self._order,
-            dots.reshape(-1, FIELDS),
-            used.ravel(),
-            self.options.floor_px,
-            plain(seen),
+            self._every_id, self._order, dots.reshape(-1, FIELDS), used.ravel(), self.options.floor_px, plain(seen)
         )
         return seen.observation(frame, count)
 
@@ -637,9 +625,7 @@ def _pattern(name: str, ids: Sequence[int], positions: FloatArray, radius: float
     turns = edges[:, 0] * np.roll(edges[:, 1], -1) - edges[:, 1] * np.roll(edges[:, 0], -1)
     if not (turns > 0).all():
         raise DriverError(
-            "option",
-            f"face {name!r}: its first four dots are not convex and clockwise (x right, y down)",
-            face=name,
+            "option", f"face {name!r}: its first four dots are not convex and clockwise (x right, y down)", face=name
         )
     unit = 0.5 * float(np.linalg.norm(edges, axis=1).mean())
     scaled = np.ascontiguousarray((positions - corners.mean(axis=0)) / unit)

@@ -36,12 +36,7 @@ from stereoservo_drivers.detectors.landmark_search import (
     take_better,
 )
 from stereoservo_drivers.detectors.landmarks import KINDS, CameraReference, Landmarks
-from stereoservo_drivers.detectors.patch_alignment import (
-    TEMPLATE_LEVELS,
-    Alignment,
-    ReferencePatches,
-    build_pyramid,
-)
+from stereoservo_drivers.detectors.patch_alignment import TEMPLATE_LEVELS, Alignment, ReferencePatches, build_pyramid
 
 SMALLEST_PICTURE = 64
 AS_A_PLANE = 4.0
@@ -113,8 +108,7 @@ def learn_landmarks(
     pictures = _means(views, "images")
     if len(pictures) < 2:
         raise DriverError(
-            "images",
-            f"images of {len(pictures)} camera(s); landmarks are matched between cameras: give at least two",
+            "images", f"images of {len(pictures)} camera(s); landmarks are matched between cameras: give at least two"
         )
     names = list(pictures)
     base = names[0]

@@ -104,11 +104,7 @@ class Surroundings:
 def nothing(m: int) -> Alignment:
     """An empty result for m landmarks."""
     return Alignment(
-        np.tile(np.eye(2), (m, 1, 1)),
-        np.zeros((m, 2)),
-        np.zeros((m, 2, 2)),
-        np.zeros(m),
-        np.zeros(m, np.bool_),
+        np.tile(np.eye(2), (m, 1, 1)), np.zeros((m, 2)), np.zeros((m, 2, 2)), np.zeros(m), np.zeros(m, np.bool_)
     )
 
 

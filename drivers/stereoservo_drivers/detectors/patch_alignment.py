@@ -202,12 +202,7 @@ def _compose_inverse(A: FloatArray, p: FloatArray, step: FloatArray, gain: float
 
 @kernel
 def _align_patch(
-    picture: ImageArray,
-    template: Template,
-    iterations: int,
-    A: FloatArray,
-    p: FloatArray,
-    measured: FloatArray,
+    picture: ImageArray, template: Template, iterations: int, A: FloatArray, p: FloatArray, measured: FloatArray
 ) -> int:
     """Move the warp ``A`` (2, 2), ``p`` (2,) until its patch fits ``picture``; returns the outcome. Writes ``measured``
     (3,).

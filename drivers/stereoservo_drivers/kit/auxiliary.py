@@ -18,10 +18,7 @@ def verify_order(values: Mapping[str, float], specs: tuple[AuxiliarySpec, ...]) 
         allowed = value in (0.0, 1.0) if spec.kind == "digital" else spec.low <= value <= spec.high
         if not allowed:
             raise DriverError(
-                "auxiliary",
-                f"{name}: {value:g}; {spec.low:g} to {spec.high:g} is valid",
-                name=name,
-                value=value,
+                "auxiliary", f"{name}: {value:g}; {spec.low:g} to {spec.high:g} is valid", name=name, value=value
             )
 
 
@@ -31,8 +28,7 @@ def verify_specs(specs: tuple[AuxiliarySpec, ...]) -> None:
     for spec in specs:
         if names.count(spec.name) > 1:
             raise DriverError(
-                "options",
-                f"auxiliary name {spec.name!r} occurs {names.count(spec.name)} times; once is valid",
+                "options", f"auxiliary name {spec.name!r} occurs {names.count(spec.name)} times; once is valid"
             )
         if spec.kind != "digital" and not (spec.low < spec.high and spec.velocity > 0.0):
             raise DriverError(

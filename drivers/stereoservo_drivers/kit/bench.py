@@ -23,7 +23,7 @@ FRESH_SHARE = 0.5
 """
 STAMP_REMEDY = (
     "stamps are times of context.clock, never later than now, and rise; a device's own clock is brought to it by "
-    "kit.device_clock"
+    "kit.timing"
 )
 RUNAWAY_REMEDY = (
     "units [rad, m] and gear of commands and positions; of a Cartesian arm, units and axes of its pose and its twists; "
@@ -142,8 +142,7 @@ class JointBench:
             driver = self.setup.make_driver(self.context)
         except Exception as error:  # whatever a third party's constructor raises
             raise CheckFailedError(
-                f"the driver cannot be made: {told(error)}",
-                "its options: `--options`, `--cell`, make_driver()",
+                f"the driver cannot be made: {told(error)}", "its options: `--options`, `--cell`, make_driver()"
             ) from error
         self._drivers.append(driver)
         return driver

@@ -67,11 +67,7 @@ class CartesianJointDriver:
     """
 
     def __init__(
-        self,
-        arm: CartesianArm,
-        description: JointDriverDescription,
-        attitude: FloatArray,
-        frame: Frame = "base",
+        self, arm: CartesianArm, description: JointDriverDescription, attitude: FloatArray, frame: Frame = "base"
     ) -> None:
         self._arm = arm
         self._description = description

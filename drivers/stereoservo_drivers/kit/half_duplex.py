@@ -125,7 +125,5 @@ class HalfDuplexBus:
     @staticmethod
     def _lost(what: str) -> DriverError:
         return DriverError(
-            "connection_lost",
-            f"servo bus: {what}; check the cable, the servos' supply and their ids",
-            retry=True,
+            "connection_lost", f"servo bus: {what}; check the cable, the servos' supply and their ids", retry=True
         )

@@ -282,8 +282,7 @@ def _unreached(place: Place, error: Exception, timeout_s: float) -> DriverError:
         return place.error("unknown_host", f"its host has no address ({error})", retry=True)
     if isinstance(error, ssl.SSLError):
         return place.error(
-            "tls",
-            f"no trusted TLS connection ({error.reason or error}); http:// on a network of its own needs none",
+            "tls", f"no trusted TLS connection ({error.reason or error}); http:// on a network of its own needs none"
         )
     if isinstance(error, http.client.HTTPException):
         return place.error("http", f"does not speak HTTP ({type(error).__name__})")

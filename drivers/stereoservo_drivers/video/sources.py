@@ -564,9 +564,7 @@ class GenicamSource:
             self._camera = self._call("arv_camera_new", name.encode())
         except AravisError as error:
             raise self._place.error(
-                "not_opened",
-                f"no such camera answers ({error}); `arv-tool-0.8` lists those there are",
-                retry=True,
+                "not_opened", f"no such camera answers ({error}); `arv-tool-0.8` lists those there are", retry=True
             ) from error
         if self._held_by_another():
             raise self._place.error("busy", "another program controls this camera: end it first", retry=True)

@@ -8,8 +8,11 @@ import ast
 import importlib.util
 import sys
 import traceback
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 from typer.core import TyperGroup
@@ -18,41 +21,63 @@ from typer.models import CommandInfo
 
 import stereoservo
 from stereoservo.cli.early_stop import RaisedStop
-from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, known, note
+from stereoservo.cli.output import EXIT_FAILED, EXIT_INTERRUPTED, EXIT_USAGE, CommandError, fail, is_known_error, log
 from stereoservo.ports import plugins
 
-COMMANDS: dict[str, str] = {
-    "run": "run:run",
-    "status": "status:status",
-    "stop": "stop:stop",
-    "goal": "goal:goal",
-    "teach": "teach:teach",
-    "jog": "jog:jog",
-    "auxiliary": "auxiliary:auxiliary",
-    "home": "home:home",
-    "calibrate": "calibrate.command:calibrate",
-    "watch": "watch.command:watch",
-    "web": "web:web",
-    "enable": "operator_commands:enable",
-    "disable": "operator_commands:disable",
-    "hold": "operator_commands:hold",
-    "resume": "operator_commands:resume",
-    "reset": "operator_commands:reset",
-    "acknowledge": "operator_commands:acknowledge",
-    "cancel": "operator_commands:cancel",
-    "record": "record:record",
-    "replay": "replay:replay",
-    "export": "export:export",
-    "examine": "examine:examine",
-    "ik": "ik:ik",
-    "drivers": "drivers:drivers",
-    "doctor": "doctor.command:doctor",
-    "setup": "setup.command:setup",
-    "init": "init:init",
-    "ls": "ls:ls",
-    "warmup": "warmup:warmup",
+
+class Command(NamedTuple):
+    """A command: its ``group`` in ``--help``, its ``place`` (module:function below `stereoservo.cli`; empty: found by
+    entry point), and the arguments of an ``example``.
+    """
+
+    group: str
+    place: str
+    example: str
+
+
+COMMANDS = {
+    "setup": Command("Set up", "setup.command:setup", "mycell.toml"),
+    "init": Command("Set up", "init:init", "mycell.toml"),
+    "doctor": Command("Set up", "doctor.command:doctor", "mycell.toml"),
+    "drivers": Command("Set up", "drivers:drivers", ""),
+    "print-plate": Command("Set up", "", "plate.pdf"),
+    "learn-corners": Command("Set up", "", "mycell.toml landmarks.npz --ask-to-move"),
+    "driver-check": Command("Set up", "", "mycell.toml"),
+    "warmup": Command("Set up", "warmup:warmup", "demo"),
+    "run": Command("Run", "run:run", "mycell.toml --commissioning"),
+    "status": Command("Run", "status:status", "mycell"),
+    "ls": Command("Run", "status:ls", ""),
+    "enable": Command("Run", "operator_commands:enable", "mycell"),
+    "disable": Command("Run", "operator_commands:disable", "mycell"),
+    "reset": Command("Run", "operator_commands:reset", "mycell"),
+    "hold": Command("Run", "operator_commands:hold", "mycell"),
+    "resume": Command("Run", "operator_commands:resume", "mycell"),
+    "stop": Command("Run", "stop:stop", "mycell"),
+    "calibrate": Command("Move", "calibrate.command:calibrate", "mycell --check"),
+    "teach": Command("Move", "teach:teach", "mycell dock"),
+    "goal": Command("Move", "goal:goal", "mycell dock --check"),
+    "ik": Command("Move", "ik:ik", "mycell dock"),
+    "acknowledge": Command("Move", "operator_commands:acknowledge", "mycell ID"),
+    "cancel": Command("Move", "operator_commands:cancel", "mycell"),
+    "jog": Command("Move", "operator_commands:jog", "mycell j1=0.05 --seconds 1"),
+    "home": Command("Move", "home:home", "mycell"),
+    "auxiliary": Command("Move", "operator_commands:auxiliary", "mycell gripper=0.04"),
+    "watch": Command("Look", "watch:watch", "mycell"),
+    "web": Command("Look", "web:web", "mycell --operate ann"),
+    "record": Command("Look", "record:record", "mycell --images --seconds 60"),
+    "replay": Command("Look", "replay:replay", "flight.mcap"),
+    "export": Command("Look", "export:export", "flight.mcap"),
+    "examine": Command("Look", "examine:examine", "flight.mcap"),
+    "demo": Command("Simulate and measure", "", "--lockstep"),
+    "emulate": Command("Simulate and measure", "", "drives hil-can"),
+    "simulate": Command("Simulate and measure", "", "TASKS.csv --law cartesian3"),
+    "reproduce": Command("Simulate and measure", "", "all --html thesis.html"),
+    "bench": Command("Simulate and measure", "", "cycle --json"),
 }
-"""Commands of the service: name -> module:function below ``stereoservo.cli``."""
+"""All known commands, in the order in which they are needed; any other that is installed is listed below ``OTHERS``."""
+OWN = {name: command.place for name, command in COMMANDS.items() if command.place}
+"""Commands of the service."""
+OTHERS = "Others"
 
 ANYTHING = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Settings of a command that accepts any arguments."""
@@ -70,8 +95,8 @@ class LazyGroup(TyperGroup):
     """True while the shell completes names: no command is then imported for its text."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        extra = [name for name in plugins.names(plugins.COMMANDS) if name not in COMMANDS]
-        return [*COMMANDS, *extra]
+        extra = [name for name in plugins.names(plugins.COMMANDS) if name not in OWN]
+        return [*OWN, *extra]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name not in self.list_commands(ctx):
@@ -105,7 +130,7 @@ class LazyGroup(TyperGroup):
             commands = [(name, _described(name, places[name]) or self.get_command(ctx, name)) for name in names]
             with formatter.section(heading):
                 formatter.write_dl([(name, command.get_short_help_str(WHOLE)) for name, command in commands])
-            example = next((EXAMPLES[name] for name in names if name in EXAMPLES), "")
+            example = next(filter(None, map(example_of, names)), "")
             if example:
                 formatter.write_text(f"  for example: stereoservo {example}")
 
@@ -117,7 +142,7 @@ WHOLE = 1000
 def _places() -> dict[str, str]:
     """Location of each command: ``module:function``."""
     extra = {plugin.name: plugin.value for plugin in plugins.list_plugins(plugins.COMMANDS)}
-    return extra | {name: f"stereoservo.cli.{where}" for name, where in COMMANDS.items()}
+    return extra | {name: f"stereoservo.cli.{where}" for name, where in OWN.items()}
 
 
 def _described(name: str, where: str) -> Any:
@@ -142,7 +167,7 @@ def _described(name: str, where: str) -> Any:
 
 
 def _load(name: str) -> Any:
-    where = COMMANDS.get(name)
+    where = OWN.get(name)
     if where is None:
         return plugins.load(plugins.COMMANDS, name)
     module, _, function = where.partition(":")
@@ -162,9 +187,9 @@ def _broken(code: str, message: str) -> Any:
 def _command(name: str, function: Any, context_settings: dict[Any, Any] | None = None) -> Any:
     """Typer command of one function."""
     single = typer.Typer(add_completion=False, rich_markup_mode=None)
-    epilog = f"Example: stereoservo {EXAMPLES[name]}" if name in EXAMPLES else None
+    epilog = f"Example: stereoservo {example}" if (example := example_of(name)) else None
     single.registered_commands.append(
-        CommandInfo(name=name, callback=function, context_settings=context_settings, epilog=epilog)
+        CommandInfo(name=name, callback=expanded(function), context_settings=context_settings, epilog=epilog)
     )
     command = get_command(single)
     command.name = name
@@ -208,14 +233,14 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
         context = getattr(error, "ctx", None)
         message = error.format_message() if hasattr(error, "format_message") else str(error)
         if context is not None and not as_json:
-            note(context.get_usage())
+            log(context.get_usage())
         fail(CommandError("usage", message), as_json)
         return EXIT_USAGE
     except Exception as error:
         lacking = plugins.missing_extra(error)
         if lacking is not None:
             error = CommandError("missing_extra", lacking)
-        if not known(error):
+        if not is_known_error(error):
             traceback.print_exc()
         fail(error, as_json)
         return EXIT_FAILED
@@ -224,73 +249,40 @@ def run(arguments: list[str], raised: RaisedStop | None) -> int:
     return code if isinstance(code, int) else 0
 
 
-# -- groups of verbs -----------------------------------------------------------------------------------------
-# Additional texts of ``--help``: the group of each command and an example.
-
-
-GROUPS: dict[str, tuple[str, ...]] = {
-    "Set up": (
-        "setup",
-        "init",
-        "doctor",
-        "drivers",
-        "print-plate",
-        "learn-corners",
-        "driver-check",
-        "warmup",
-    ),
-    "Run": ("run", "status", "ls", "enable", "disable", "reset", "hold", "resume", "stop"),
-    "Move": ("calibrate", "teach", "goal", "ik", "acknowledge", "cancel", "jog", "home", "auxiliary"),
-    "Look": ("watch", "web", "record", "replay", "export", "examine"),
-    "Simulate and measure": ("demo", "emulate", "simulate", "reproduce", "bench"),
-}
-"""Headings and their commands, in the order in which they are needed; any other command is listed below ``OTHERS``."""
-OTHERS = "Others"
-EXAMPLES: dict[str, str] = {
-    "setup": "setup mycell.toml",
-    "init": "init mycell.toml",
-    "doctor": "doctor mycell.toml",
-    "drivers": "drivers",
-    "print-plate": "print-plate plate.pdf",
-    "learn-corners": "learn-corners mycell.toml landmarks.npz --ask-to-move",
-    "driver-check": "driver-check mycell.toml",
-    "warmup": "warmup demo",
-    "run": "run mycell.toml --commissioning",
-    "status": "status mycell",
-    "ls": "ls",
-    "enable": "enable mycell",
-    "disable": "disable mycell",
-    "reset": "reset mycell",
-    "hold": "hold mycell",
-    "resume": "resume mycell",
-    "stop": "stop mycell",
-    "calibrate": "calibrate mycell --check",
-    "teach": "teach mycell dock",
-    "goal": "goal mycell dock --check",
-    "ik": "ik mycell dock",
-    "acknowledge": "acknowledge mycell ID",
-    "cancel": "cancel mycell",
-    "jog": "jog mycell j1=0.05 --seconds 1",
-    "home": "home mycell",
-    "auxiliary": "auxiliary mycell gripper=0.04",
-    "watch": "watch mycell",
-    "web": "web mycell --operate ann",
-    "record": "record mycell --images --seconds 60",
-    "replay": "replay flight.mcap",
-    "export": "export flight.mcap",
-    "examine": "examine flight.mcap",
-    "demo": "demo --lockstep",
-    "emulate": "emulate drives hil-can",
-    "simulate": "simulate TASKS.csv --law cartesian3",
-    "reproduce": "reproduce all --html thesis.html",
-    "bench": "bench cycle --json",
-}
-"""By command, without the program's name."""
+def example_of(name: str) -> str:
+    """An example of a command's use, without the program's name; empty if there is none."""
+    return f"{name} {COMMANDS[name].example}".strip() if name in COMMANDS else ""
 
 
 def grouped(names: list[str]) -> list[tuple[str, list[str]]]:
     """Headings with the available commands of each; commands without a group come last."""
-    known = {name for members in GROUPS.values() for name in members}
-    groups = [(heading, [name for name in members if name in names]) for heading, members in GROUPS.items()]
-    groups.append((OTHERS, [name for name in names if name not in known]))
-    return [(heading, members) for heading, members in groups if members]
+    groups: dict[str, list[str]] = {group: [] for group in (*(row.group for row in COMMANDS.values()), OTHERS)}
+    for name in sorted(names, key=[*COMMANDS, *names].index):
+        groups[COMMANDS[name].group if name in COMMANDS else OTHERS].append(name)
+    return [(heading, members) for heading, members in groups.items() if members]
+
+
+# -- options that are declared as the fields of a dataclass -------------------------------------------------------
+
+
+def expanded(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with every parameter of a dataclass replaced by the fields of that dataclass, as options."""
+    own = signature(function, eval_str=True).parameters
+    groups: dict[str, Any] = {name: one.annotation for name, one in own.items() if is_dataclass(one.annotation)}
+    if not groups:
+        return function
+    parameters = [
+        parameter.replace(kind=Parameter.KEYWORD_ONLY)
+        for name, one in own.items()
+        for parameter in (signature(groups[name], eval_str=True).parameters.values() if name in groups else [one])
+    ]
+
+    def called(**given: Any) -> Any:
+        for name, group in groups.items():
+            given[name] = group(**{field.name: given.pop(field.name) for field in fields(group)})
+        return function(**given)
+
+    called.__doc__ = function.__doc__
+    called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+    called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return called

@@ -21,7 +21,7 @@ from stereoservo.calibration.examination.examination import RecordingReport, exa
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import TrialCamera
-from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.state_encoding import StateVersionError, decode_state
 from stereoservo.kinematics.model import CellModel
 from stereoservo.kinematics.parameterization import Kind
@@ -40,13 +40,11 @@ def examine(
     dataset: Annotated[
         Path,
         typer.Argument(
-            metavar="DATASET",
-            help="A flight recording (*.mcap), a folder or a LeRobot data set: docs/recordings.md.",
+            metavar="DATASET", help="A flight recording (*.mcap), a folder or a LeRobot data set: docs/recordings.md."
         ),
     ],
     units: Annotated[
-        str | None,
-        typer.Option(help="Of a LeRobot data set: in what its states are, such as deg,gripper.pos=none."),
+        str | None, typer.Option(help="Of a LeRobot data set: in what its states are, such as deg,gripper.pos=none.")
     ] = None,
     cameras: Annotated[
         str | None, typer.Option(help="Of a LeRobot data set: the cameras to examine, such as top,side.")
@@ -138,7 +136,7 @@ def read_flight(path: Path) -> RecordedViews:
     seen = [one for one in observations if one.camera in cameras]
     every = max(1, -(-len(seen) // MOST_FRAMES))
     if every > 1:
-        note(f"{len(seen)} frames: of each camera one in {every} is examined")
+        log(f"{len(seen)} frames: of each camera one in {every} is examined")
     ranks = dict.fromkeys(cameras, 0)
     kept: list[CameraObservation] = []
     for one in sorted(seen, key=lambda o: (o.t_shutter_ns, cameras.index(o.camera))):
@@ -228,7 +226,7 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     stamps, joint_times, states = _one_clock(rows)
     every = max(1, -(-len(rows.stamp) * len(keys) // MOST_FRAMES))
     if every > 1:
-        note(f"{len(rows.stamp) * len(keys)} pictures: of each camera one in {every} is examined")
+        log(f"{len(rows.stamp) * len(keys)} pictures: of each camera one in {every} is examined")
     frames, notes = GatheredFrames({}), []
     for name, key in keys.items():
         look = stated_detector(detector or folder / DETECTOR, name)
@@ -245,7 +243,7 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
             }
             seen[float(stamps[row])] = -1, int(rows.episode[row]), markers
         found = sum(bool(markers) for _, _, markers in seen.values())
-        note(f"camera {name}: markers in {found} of {len(seen)} pictures")
+        log(f"camera {name}: markers in {found} of {len(seen)} pictures")
         if found and size is not None:
             frames.sizes[name] = size
             frames.seen |= {(name, stamp): frame for stamp, frame in seen.items()}
@@ -259,7 +257,7 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
         )
     counted = bool(np.abs(rows.stamp - rows.frame / info.fps).max() < COUNTED_S)
     if counted:
-        note("stamps are the count of frames over the rate: dropped frames cannot be told")
+        log("stamps are the count of frames over the rate: dropped frames cannot be told")
     positions = states[:, columns] * scales
     views = gathered_views(frames, joint_times, names, kinds, positions, None, True, counted)
     return replace(views, notes=tuple(notes))
@@ -292,13 +290,7 @@ def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
 # docs/recordings.md has the format.
 
 
-JOINTS, POSES, MARKERS, FRAMES, CAMERAS = (
-    "joints.csv",
-    "poses.csv",
-    "markers.csv",
-    "frames.csv",
-    "cameras.csv",
-)
+JOINTS, POSES, MARKERS, FRAMES, CAMERAS = ("joints.csv", "poses.csv", "markers.csv", "frames.csv", "cameras.csv")
 DETECTOR = "detector.toml"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
@@ -364,7 +356,7 @@ def gathered_views(
     keys = sorted(frames.seen, key=lambda one: (one[1], cameras.index(one[0])))
     inside = [k for k in keys if stamps[0] <= k[1] <= stamps[-1] and (timed or k[1] in stamps)]
     if len(inside) < len(keys):
-        note(f"{len(keys) - len(inside)} of {len(keys)} frames are left out: no joints or poses at their stamps")
+        log(f"{len(keys) - len(inside)} of {len(keys)} frames are left out: no joints or poses at their stamps")
     ids = tuple(sorted({i for key in inside for i in frames.seen[key][2]}))
     column = {marker: k for k, marker in enumerate(ids)}
     pixels, sigmas = np.full((len(inside), len(ids), 2), np.nan), np.ones((len(inside), len(ids)))
@@ -440,11 +432,7 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
         sigma = _number(path, line, row, "sigma") if row.get("sigma") else STATED_PX
         if not sigma > 0.0:
             raise _wrong(path, line, "sigma", row["sigma"], "a positive number [px]")
-        seen[_whole(path, line, row, "marker")] = (
-            _number(path, line, row, "u"),
-            _number(path, line, row, "v"),
-            sigma,
-        )
+        seen[_whole(path, line, row, "marker")] = (_number(path, line, row, "u"), _number(path, line, row, "v"), sigma)
     return frames
 
 
@@ -466,7 +454,7 @@ def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
         seen.update(detected(detectors[camera], camera, line, image))
         found[camera] += bool(seen)
     for camera in cameras:
-        note(f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures")
+        log(f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures")
     return frames
 
 
@@ -532,8 +520,7 @@ def _time_column(path: Path, rows: Rows) -> str:
     found = [name for name in (TIME, ORDER) if name in rows[0]]
     if len(found) != 1:
         raise CommandError(
-            "dataset",
-            f"{path} needs one of the columns {TIME!r} [s] and {ORDER!r}; it has {found or 'neither'}",
+            "dataset", f"{path} needs one of the columns {TIME!r} [s] and {ORDER!r}; it has {found or 'neither'}"
         )
     return found[0]
 

@@ -17,7 +17,7 @@ import typer
 from foxglove.messages import CompressedImage
 from mcap.writer import CompressionType, Writer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.homogeneous import GeometryError
@@ -36,12 +36,14 @@ from stereoservo.recording.foxglove_channels import (
     Published,
     cell_status,
     joints,
-    log,
     markers_seen,
     reasons,
     schema_of,
     set_points_of,
     stamp,
+)
+from stereoservo.recording.foxglove_channels import (
+    log as log_entry,
 )
 from stereoservo.recording.replay import RecordingError, ReplayResult, recorded_span, replay, whole_messages
 from stereoservo.recording.step_layout import decode_step
@@ -64,8 +66,7 @@ def export(
         ),
     ],
     output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", help="Of a recording: file to write (default: FILE.foxglove.mcap)."),
+        Path | None, typer.Option("--output", "-o", help="Of a recording: file to write (default: FILE.foxglove.mcap).")
     ] = None,
     urdf: Annotated[
         Path | None, typer.Option("--urdf", metavar="FILE", help="Of a metric model: the URDF file to write.")
@@ -86,18 +87,14 @@ def export(
     cell: Annotated[
         Path | None,
         typer.Option(
-            "--cell",
-            metavar="FILE",
-            help="Cell file: calibration.known_length, and safety.limit for the URDF.",
+            "--cell", metavar="FILE", help="Cell file: calibration.known_length, and safety.limit for the URDF."
         ),
     ] = None,
     opencv: Annotated[
-        Path | None,
-        typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write."),
+        Path | None, typer.Option("--opencv", metavar="FILE.yml", help="Of cameras: FileStorage YAML to write.")
     ] = None,
     ros: Annotated[
-        Path | None,
-        typer.Option("--ros", metavar="DIR", help="Of cameras: folder for a camera_info YAML of each."),
+        Path | None, typer.Option("--ros", metavar="DIR", help="Of cameras: folder for a camera_info YAML of each.")
     ] = None,
     kalibr: Annotated[
         Path | None, typer.Option("--kalibr", metavar="FILE.yaml", help="Of cameras: Kalibr's camera chain.")
@@ -135,7 +132,7 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
         rig = load_rig(file)
         cameras, unit = rig.cameras, rig.unit
     if unit != "m":
-        note(f"{file} holds no length in metres: translations are in baselines")
+        log(f"{file} holds no length in metres: translations are in baselines")
     written: list[str] = []
     if opencv is not None:
         exchange.save_opencv(cameras, opencv)
@@ -143,16 +140,12 @@ def _export_cameras(file: Path, opencv: Path | None, ros: Path | None, kalibr: P
     if ros is not None:
         written += [str(path) for path in exchange.save_ros(cameras, ros)]
         if len(cameras) > 2:
-            note("camera_info has no place for the poses of more than two cameras: they are left out")
+            log("camera_info has no place for the poses of more than two cameras: they are left out")
     if kalibr is not None:
         exchange.save_kalibr(cameras, kalibr)
         written.append(str(kalibr))
     names = [camera.name for camera in cameras]
-    emit(
-        {"written": written, "cameras": names, "unit": unit},
-        f"{', '.join(names)}: {', '.join(written)}",
-        json,
-    )
+    emit({"written": written, "cameras": names, "unit": unit}, f"{', '.join(names)}: {', '.join(written)}", json)
 
 
 def _export_flight(file: Path, target: Path, json: bool) -> None:
@@ -165,7 +158,7 @@ def _export_flight(file: Path, target: Path, json: bool) -> None:
         )
     error = result.replay.max_relative_error
     if error > SAME:
-        note(
+        log(
             f"the replay on this machine or version differs from the recording (largest relative error {error:.2g}): "
             "joints and markers are those recorded, states and errors those of the replay"
         )
@@ -289,7 +282,7 @@ class FlightChannels:
                 self._targets[request.command.goal.id] = request.command.goal.target
         now_ns = inputs.now_ns + self.shift_ns
         for event in outputs.events:
-            yield log(event.t_ns + self.shift_ns, event.kind, event.message, "core")
+            yield log_entry(event.t_ns + self.shift_ns, event.kind, event.message, "core")
         codes = tuple(reason.code for reason in status.reasons)
         if codes != self._codes:
             self._codes = codes
@@ -309,12 +302,7 @@ class FlightChannels:
     def _state(self, t_ns: int, status: Status) -> Iterator[Published]:
         names = self.settings.joint_names
         yield joints(
-            "/joints",
-            t_ns,
-            names,
-            positions=status.positions,
-            velocities=status.velocities,
-            efforts=status.efforts,
+            "/joints", t_ns, names, positions=status.positions, velocities=status.velocities, efforts=status.efforts
         )
         yield joints("/command", t_ns, names, velocities=status.command)
         yield Published("/status", t_ns, cell_status(status))

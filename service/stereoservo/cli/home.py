@@ -12,16 +12,7 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.goal import follow
 from stereoservo.cli.ik import OWN_SIGMA_PX, LearntArm, learnt_arm
-from stereoservo.cli.output import (
-    CellArgument,
-    CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
-    emit,
-    note,
-    note_hold,
-)
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, emit, log, log_hold
 from stereoservo.client import Client
 from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.wire import FeaturesMessage
@@ -32,19 +23,19 @@ if TYPE_CHECKING:
 
 SPEED = 0.5
 """Share of the joints' velocity limits, as without pictures."""
-FRAMES, LOOK_S, SETTLE_S = 15, 5.0, 0.4
+FRAMES, OBSERVATION_S, SETTLE_S = 15, 5.0, 0.4
 """Number of frames averaged per camera, time limit of an observation [s], and time of rest before it [s]."""
-LOOKS = 6
+MOST_OBSERVATIONS = 6
 PROBE = 0.15
 """Longest motion of a joint [rad or m] before the observations agree on one answer."""
-TELLS_PX = 2.0
+LEAST_DIFFERENCE_PX = 2.0
 """Least difference [px] between the pictures of two postures for a motion to be made, in addition to the model's own.
 """
-AGREES = 5.0
+AGREEMENT_SIGMA = 5.0
 """Number of standard deviations within which zeros count as right."""
 
 
-class Look(NamedTuple):
+class Observation(NamedTuple):
     """One observation: joint readings (n,), raw pixels (c, m, 2) of the markers, NaN if unseen, standard deviations (c,
     m) [px].
     """
@@ -57,16 +48,13 @@ class Look(NamedTuple):
 def home(
     cell: CellArgument,
     by_vision: Annotated[
-        bool,
-        typer.Option("--by-vision", help="By the pictures of the home posture; tells by what each zero is off."),
+        bool, typer.Option("--by-vision", help="By the pictures of the home posture; tells by what each zero is off.")
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="With --by-vision: only tell the zeros; nothing moves.")
     ] = False,
     speed_scale: Annotated[float, typer.Option(help="Lowers the speed, (0, 1].")] = 1.0,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Move every joint to the cell's home position. Ctrl-C cancels.
 
@@ -75,45 +63,45 @@ def home(
     """
     if check and not by_vision:
         raise CommandError("usage", "--check goes with --by-vision; without pictures `home` has nothing to tell")
-    if by_vision and endpoint is not None:
+    if by_vision and options.endpoint is not None:
         raise CommandError("usage", "--by-vision reads the cell's model: run it on the cell's host, without --endpoint")
-    arm = learnt_arm(cell, operator) if by_vision else None
-    with Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check) as client:
+    arm = learnt_arm(cell, options.operator) if by_vision else None
+    with options.client(cell, interruption.check) as client:
         if arm is not None:
-            _by_vision(client, arm, check, speed_scale, json)
+            _by_vision(client, arm, check, speed_scale, options.json)
             return
         with client.home(speed_scale) as handle:
-            follow(handle, json, client.cell)
+            follow(handle, options.json, client.cell)
 
 
 def _by_vision(client: Client, arm: LearntArm, check: bool, speed_scale: float, as_json: bool) -> None:
     if arm.cell.scene.moves:
         raise CommandError("moves", "[scene] moves: the markers move by themselves, and tell no joint's zero")
-    target, looks = _home_of(arm), list[Look]()
-    for _ in range(LOOKS):
-        looks.append(_look(client, arm))
-        found, error_px = _zeros(arm, looks), _from_home_px(arm, looks[-1], target)
-        sure = not found.alternatives and (len(looks) > 1 or _right(found))
-        telling = _telling(arm, looks[-1], found)
+    target, observations = _home_position(arm), list[Observation]()
+    for _ in range(MOST_OBSERVATIONS):
+        observations.append(_observe(client, arm))
+        found, error_px = _estimate_zeros(arm, observations), _distance_from_home_px(arm, observations[-1], target)
+        sure = not found.alternatives and (len(observations) > 1 or _zeros_hold(found))
+        telling = _informative_motion(arm, observations[-1], found)
         if check or (sure and error_px <= _tolerance_px(arm)):
-            _report(arm, looks, found, telling, error_px, check, as_json)
+            _report(arm, observations, found, telling, error_px, check, as_json)
             return
-        way = target - found.offset - looks[-1].readings
+        displacement = target - found.offset - observations[-1].readings
         if telling is not None:
-            way = 0.0 * way
-            way[telling.joint] = telling.step
+            displacement = 0.0 * displacement
+            displacement[telling.joint] = telling.step
         elif not sure:
-            way = way * min(1.0, PROBE / max(float(abs(way).max()), 1e-12))
-        _move(client, arm, looks[-1].readings + way, SPEED * speed_scale)
+            displacement = displacement * min(1.0, PROBE / max(float(abs(displacement).max()), 1e-12))
+        _move(client, arm, observations[-1].readings + displacement, SPEED * speed_scale)
     raise CommandError(
         "not_reached",
-        f"after {LOOKS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
+        f"after {MOST_OBSERVATIONS} looks the pictures are still {error_px:.2f} px from those of the home posture, and "
         f"{1 + len(found.alternatives)} answers are possible: `stereoservo calibrate {client.cell} --check`",
         error_px=error_px,
     )
 
 
-def _home_of(arm: LearntArm) -> FloatArray:
+def _home_position(arm: LearntArm) -> FloatArray:
     """The home position (n,): the cell file's, or the base from which the model was learnt."""
     import numpy as np
 
@@ -123,7 +111,7 @@ def _home_of(arm: LearntArm) -> FloatArray:
     return np.array([stated[name] for name in arm.model.joint_names], dtype=np.float64)
 
 
-def _look(client: Client, arm: LearntArm) -> Look:
+def _observe(client: Client, arm: LearntArm) -> Observation:
     """The markers' mean pixels, with the arm at rest. Raises CommandError if the body is not seen."""
     import numpy as np
 
@@ -135,7 +123,7 @@ def _look(client: Client, arm: LearntArm) -> Look:
     frames = dict.fromkeys(cameras, 0)
     time.sleep(SETTLE_S)
     before = client.joints()
-    until = time.monotonic() + LOOK_S
+    until = time.monotonic() + OBSERVATION_S
     for message in client.watch(features=True):
         interruption.check()
         if isinstance(message, FeaturesMessage) and message.camera in frames:
@@ -164,10 +152,10 @@ def _look(client: Client, arm: LearntArm) -> Look:
     often = np.maximum(count, 1.0)
     sigmas = np.hypot(np.sqrt(variance) / often, own)
     pixels = np.where(seen[..., None], total / often[..., None], np.nan)
-    return Look(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
+    return Observation(np.array([readings[name] for name in model.joint_names]), pixels, sigmas)
 
 
-def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
+def _estimate_zeros(arm: LearntArm, observations: list[Observation]) -> JointZeros:
     """Corrections of the joint readings, from all observations. Raises CommandError if the pictures do not determine
     them, or if the resulting posture is beyond the cell's limits.
     """
@@ -176,8 +164,8 @@ def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
     from stereoservo.kinematics.joint_angles import joint_zeros
     from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
 
-    pixels, sigmas = np.array([look.pixels for look in looks]), np.array([look.sigmas for look in looks])
-    readings = np.array([look.readings for look in looks])
+    pixels, sigmas = np.array([look.pixels for look in observations]), np.array([look.sigmas for look in observations])
+    readings = np.array([look.readings for look in observations])
     check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
     try:
         found = joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
@@ -185,7 +173,7 @@ def _zeros(arm: LearntArm, looks: list[Look]) -> JointZeros:
         other = f"; zeros alone do not explain them: {check} looks for other causes"
         told = f"the pictures do not tell the joints' zeros: {error}"
         raise CommandError(error.code, told + (other if error.code == "no_agreement" else "")) from error
-    beyond = [] if found.alternatives or _right(found) else _beyond_limits(arm, readings[-1], found)
+    beyond = [] if found.alternatives or _zeros_hold(found) else _beyond_limits(arm, readings[-1], found)
     if beyond:
         raise CommandError(
             "outside_limits",
@@ -200,7 +188,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     import numpy as np
 
     at = readings + found.offset
-    slack = arm.cell.safety.position_margin + AGREES * found.deviations
+    slack = arm.cell.safety.position_margin + AGREEMENT_SIGMA * found.deviations
     low, high = arm.limits[:, 0] - slack, arm.limits[:, 1] + slack
     turns = np.array([[0.0, 1.0, -1.0] if kind == "revolute" else [0.0] * 3 for kind in arm.model.joint_kinds])
     turned = at[:, None] + 2.0 * np.pi * turns
@@ -211,7 +199,7 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     ]
 
 
-def _telling(arm: LearntArm, look: Look, found: JointZeros) -> TellingMotion | None:
+def _informative_motion(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMotion | None:
     """Motion that distinguishes the possible postures of an observation; None if one remains, or no motion does."""
     import numpy as np
 
@@ -220,12 +208,12 @@ def _telling(arm: LearntArm, look: Look, found: JointZeros) -> TellingMotion | N
     if not found.alternatives:
         return None
     postures = look.readings + np.array([found.offset, *found.alternatives])
-    least_px = TELLS_PX + _tolerance_px(arm)
+    least_px = LEAST_DIFFERENCE_PX + _tolerance_px(arm)
     return telling_motion(arm.model, postures, look.readings, arm.limits, PROBE, least_px)
 
 
-def _right(found: JointZeros) -> bool:
-    return bool((abs(found.offset) <= AGREES * found.deviations).all())
+def _zeros_hold(found: JointZeros) -> bool:
+    return bool((abs(found.offset) <= AGREEMENT_SIGMA * found.deviations).all())
 
 
 def _tolerance_px(arm: LearntArm) -> float:
@@ -235,7 +223,7 @@ def _tolerance_px(arm: LearntArm) -> float:
     return max(arm.cell.servo.tolerance_px, 3.0 * own)
 
 
-def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
+def _distance_from_home_px(arm: LearntArm, look: Observation, target: FloatArray) -> float:
     """Largest distance [px] of a marker from its position predicted by the model for the home posture."""
     import numpy as np
 
@@ -248,14 +236,14 @@ def _from_home_px(arm: LearntArm, look: Look, target: FloatArray) -> float:
 def _move(client: Client, arm: LearntArm, readings: FloatArray, speed_scale: float) -> None:
     positions = dict(zip(arm.model.joint_names, readings.tolist(), strict=True))
     with client.goal(JointTarget(positions), speed_scale=speed_scale) as handle:
-        result = handle.wait(progress=lambda event: note_hold(event.kind, event.message, client.cell))
+        result = handle.wait(progress=lambda event: log_hold(event.kind, event.message, client.cell))
     if result.outcome != "reached":
         raise CommandError(f"goal_{result.outcome}", f"the way home ended: {result.outcome}: {result.why}")
 
 
 def _report(
     arm: LearntArm,
-    looks: list[Look],
+    observations: list[Observation],
     found: JointZeros,
     telling: TellingMotion | None,
     error_px: float,
@@ -263,7 +251,7 @@ def _report(
     as_json: bool,
 ) -> None:
     name, model = arm.cell.cell.name, arm.model
-    readings, decided = looks[-1].readings, not found.alternatives
+    readings, decided = observations[-1].readings, not found.alternatives
     rows: list[dict[str, Any]] = [
         {
             "joint": joint,
@@ -275,14 +263,14 @@ def _report(
         for j, joint in enumerate(model.joint_names)
     ]
     postures = [(readings + offset).tolist() for offset in (found.offset, *found.alternatives)]
-    lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _right(found))
+    lines = _told(arm, rows) if decided else _undecided(arm, rows, postures, telling, _zeros_hold(found))
     state = "not moved" if check else "home"
-    lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(looks)} looks")
-    if decided and not _right(found):
-        note(
+    lines.append(f"{state}: {error_px:.2f} px from the pictures of the home posture, {len(observations)} looks")
+    if decided and not _zeros_hold(found):
+        log(
             f"one look may show a body, base or cameras that moved as zeros that are off: `stereoservo home {name} "
             "--by-vision` looks again from elsewhere"
-            if len(looks) == 1
+            if len(observations) == 1
             else f"set the encoders' zeros, or move those of the model: `stereoservo calibrate {name} --check "
             "--reset-zeros`"
         )
@@ -292,7 +280,7 @@ def _report(
             "decided": decided,
             "error_px": error_px,
             "joints": rows,
-            "looks": len(looks),
+            "looks": len(observations),
             "alternatives": len(found.alternatives),
             "postures": [dict(zip(model.joint_names, posture, strict=True)) for posture in postures],
             "told_by": None
@@ -318,11 +306,7 @@ def _told(arm: LearntArm, rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _undecided(
-    arm: LearntArm,
-    rows: list[dict[str, Any]],
-    postures: list[list[float]],
-    telling: TellingMotion | None,
-    right: bool,
+    arm: LearntArm, rows: list[dict[str, Any]], postures: list[list[float]], telling: TellingMotion | None, right: bool
 ) -> list[str]:
     """Lines on an observation that several postures explain."""
     lines = [

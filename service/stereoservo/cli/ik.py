@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, emit
-from stereoservo.cli.target_options import make_goal, target_tree
+from stereoservo.cli.goal import make_goal, target_tree
+from stereoservo.cli.output import CellArgument, CommandError, JsonOption, OperatorOption, SetPointsOption, emit
 from stereoservo.client import Client
 from stereoservo.client.errors import RefusedError
 from stereoservo.messages.cell_file import CellFile, load_cell_file
@@ -48,10 +48,7 @@ class LearntArm:
 def ik(
     cell: CellArgument,
     name: Annotated[str, typer.Argument(metavar="[GOAL]", help="Name of a taught goal.")] = "",
-    set_points: Annotated[
-        Path | None,
-        typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.'),
-    ] = None,
+    set_points: SetPointsOption = None,
     operator: OperatorOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -144,8 +141,7 @@ def _images(arm: LearntArm, target: dict[str, Any]) -> tuple[FloatArray, FloatAr
         goals = load_taught(cell_directories(arm.cell.cell.name).taught)
         if target["name"] not in goals:
             raise CommandError(
-                "unknown_goal",
-                f"no taught goal {target['name']!r}; taught: {', '.join(sorted(goals)) or 'none'}",
+                "unknown_goal", f"no taught goal {target['name']!r}; taught: {', '.join(sorted(goals)) or 'none'}"
             )
         goal = goals[target["name"]]
         seen, stated = goal.target.set_points, goal.sigmas

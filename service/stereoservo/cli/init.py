@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, emit, log, shipped_or_path
 from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, check_joints, load_cell_file
 from stereoservo.messages.directories import CELL_NAME
@@ -75,8 +75,7 @@ def init(
             "`stereoservo setup` find the drives",
         ) from error
     described: CameraDescription = plugins.load(plugins.CAMERA_DRIVERS, camera_driver)(
-        {},
-        DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0]),
+        {}, DriverContext(MonotonicClock(), cell, Path("/nonexistent"), file.absolute().parent, camera=cameras[0])
     ).describe()
     detector_name = detector if described.delivers == "frames" else ""
     sections = [CameraSection(name, camera_driver, detector_name) for name in cameras]
@@ -86,7 +85,7 @@ def init(
         raise CommandError("file", f"{file}: {error.strerror}") from error
     check_joints(load_cell_file(file), tuple(joint.name for joint in joints.joints), file)
     for text in joints.notes:
-        note(text)
+        log(text)
     emit({"cell": cell, "file": str(file)}, f"wrote {file}; next: stereoservo doctor {file}", json)
 
 

@@ -36,7 +36,7 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
     raise KeyboardInterrupt
 
 
-class Ending:
+class ShutdownRequest:
     """Whether a server was requested to end. ``wake``: called in the main thread when it is."""
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Ending:
 
 
 @contextmanager
-def ending(seconds: float) -> Iterator[Ending]:
+def graceful_shutdown(seconds: float) -> Iterator[ShutdownRequest]:
     """Context manager in which SIGINT and SIGTERM request the end and raise nothing. An exception at an arbitrary place
     breaks an event loop: a task may lose a step that is then waited for, and in a destructor the exception itself is
     lost.
@@ -53,7 +53,7 @@ def ending(seconds: float) -> Iterator[Ending]:
     A process that has not ended ``seconds`` after the request is ended by force, and the stacks of its threads are
     printed. A second signal ends it at once.
     """
-    found = Ending()
+    found = ShutdownRequest()
 
     def ask(signum: int, frame: FrameType | None) -> None:
         if found.asked:
@@ -71,7 +71,7 @@ def ending(seconds: float) -> Iterator[Ending]:
             signal.signal(number, handler)
 
 
-def threads_left(seconds: float) -> list[str]:
+def unfinished_threads(seconds: float) -> list[str]:
     """Names of the other threads that have not ended within ``seconds``: an exit waits for some of them, and interrupts
     others inside their libraries.
     """
@@ -82,7 +82,7 @@ def threads_left(seconds: float) -> list[str]:
     return [thread.name for thread in others if thread.is_alive()]
 
 
-def leave(code: int) -> None:
+def exit_now(code: int) -> None:
     """End the process without waiting for other threads."""
     sys.stdout.flush()
     sys.stderr.flush()

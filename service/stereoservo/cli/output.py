@@ -5,12 +5,17 @@ from __future__ import annotations
 import os
 import re
 import sys
+from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, TextIO
 
 import msgspec
 import typer
+
+if TYPE_CHECKING:
+    from stereoservo.client import Client
 
 EXIT_FAILED = 1
 EXIT_USAGE = 2
@@ -42,19 +47,40 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print exactly one JSON
 CellArgument = Annotated[
     str,
     typer.Argument(
-        metavar="CELL",
-        help="Name of a live cell, or path of a cell file (*.toml).",
-        autocompletion=cells_beginning,
+        metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).", autocompletion=cells_beginning
     ),
 ]
 EndpointOption = Annotated[
-    str | None,
-    typer.Option("--endpoint", help="zenoh endpoint of a daemon on another host (CELL is then its name)."),
+    str | None, typer.Option("--endpoint", help="zenoh endpoint of a daemon on another host (CELL is then its name).")
 ]
 OperatorOption = Annotated[
-    str | None,
-    typer.Option("--operator", help="Name under which commands are given (default: user and process)."),
+    str | None, typer.Option("--operator", help="Name under which commands are given (default: user and process).")
 ]
+SetPointsOption = Annotated[
+    Path | None, typer.Option("--set-points", metavar="FILE", help='JSON: {"camera": {"marker": [u, v]}} in pixels.')
+]
+
+
+@dataclass(frozen=True)
+class CellOptions:
+    """Options of a command to a live cell; `dispatch` makes each field of a dataclass an option of the command line."""
+
+    endpoint: EndpointOption = None
+    operator: OperatorOption = None
+    json: JsonOption = False
+
+    def client(self, cell: str, while_waiting: Callable[[], None] = lambda: None) -> Client:
+        """Client of the cell, with these options."""
+        from stereoservo.client import Client
+
+        return Client(cell, endpoint=self.endpoint, operator=self.operator, while_waiting=while_waiting)
+
+    def emit(self, result: Any, text: str) -> None:
+        """Print a result: as JSON with ``--json``, else the text."""
+        emit(result, text, self.json)
+
+
+CELL_OPTIONS = CellOptions()
 
 
 class CommandError(Exception):
@@ -80,24 +106,24 @@ def coloured(text: str, colour: str, stream: TextIO) -> str:
     return typer.style(text, fg=colour, bold=True) if stream.isatty() and not os.environ.get("NO_COLOR") else text
 
 
-def note(message: str) -> None:
+def log(message: str) -> None:
     """Print progress and remarks on stderr; if that fails because of a full disk, only they are lost."""
     with suppress(OSError):
         print(message, file=sys.stderr, flush=True)
 
 
-def note_hold(kind: str, message: str, cell: str) -> None:
+def log_hold(kind: str, message: str, cell: str) -> None:
     """Print that a motion which is waited for was held or resumed, and how to continue; nothing for other events."""
     if kind == "held":
-        note(f"{message}: nothing moves until `stereoservo resume {cell}`")
+        log(f"{message}: nothing moves until `stereoservo resume {cell}`")
     elif kind == "resumed":
-        note(message)
+        log(message)
 
 
 def fail(error: BaseException, as_json: bool) -> None:
     """Print a failure: the message on stderr, and ``{"error": …}`` on stdout with ``--json``."""
     message = str(error) or type(error).__name__
-    note(f"{coloured('error:', 'red', sys.stderr)} {message}")
+    log(f"{coloured('error:', 'red', sys.stderr)} {message}")
     if as_json:
         body: dict[str, Any] = {"code": code_of(error), "message": message}
         reply = getattr(error, "reply", None)
@@ -115,7 +141,7 @@ def code_of(error: BaseException) -> str:
     return given if isinstance(given, str) and given else _snake(type(error).__name__)
 
 
-def known(error: BaseException) -> bool:
+def is_known_error(error: BaseException) -> bool:
     """Whether an exception is raised by this project on purpose, so that its text suffices without a traceback."""
     return type(error).__module__.split(".")[0].startswith("stereoservo") or isinstance(error, OSError)
 

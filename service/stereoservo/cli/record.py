@@ -11,16 +11,8 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import (
-    CellArgument,
-    CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
-    emit,
-    note,
-)
-from stereoservo.client import Client, EventWatch, HeardEvents
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, log
+from stereoservo.client import EventWatch, HeardEvents
 from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.wire import EventMessage
 
@@ -32,21 +24,18 @@ def record(
     cell: CellArgument,
     seconds: Annotated[float, typer.Option(help="For how long (default: until Ctrl-C).", min=0.0)] = math.inf,
     images: Annotated[
-        bool,
-        typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it."),
+        bool, typer.Option("--images", help="With what the cameras deliver, without loss, in NAME.images beside it.")
     ] = False,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Record the flight of a live cell into a file on its host; `replay` runs it again."""
 
     def hear(event: EventMessage) -> None:
         if event.kind in ("images_ended", "recording_failed"):
-            note(event.message)
+            log(event.message)
 
     recorded: ImagesRecorded | None = None
-    with Client(cell, endpoint=endpoint, operator=operator) as client, EventWatch(client) as watch:
+    with options.client(cell) as client, EventWatch(client) as watch:
         heard = HeardEvents(watch, lambda event: True, hear)
         client.record(images=images)
         file = client.info().recording
@@ -56,14 +45,14 @@ def record(
                 client.record(on=False)
                 raise CommandError("recording_failed", began.message)
             file = began.message
-        note(f"recording into {file}; Ctrl-C ends it")
+        log(f"recording into {file}; Ctrl-C ends it")
         until = time.monotonic() + seconds
         try:
             while time.monotonic() < until:
                 time.sleep(min(0.5, max(0.0, until - time.monotonic())))
                 heard.poll()
         except KeyboardInterrupt:
-            note("ending the recording")
+            log("ending the recording")
         finally:
             reply = client.record(on=False)
         if images:
@@ -78,4 +67,4 @@ def record(
             + ("" if one.why == "ended" else f", {one.why}")
             for one in recorded.cameras
         ]
-    emit(result, "\n".join(lines), json)
+    options.emit(result, "\n".join(lines))

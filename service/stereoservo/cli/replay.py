@@ -16,8 +16,7 @@ from stereoservo.recording.replay import replay as replay_file
 
 
 def replay(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A flight recording (*.mcap).")],
-    json: JsonOption = False,
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A flight recording (*.mcap).")], json: JsonOption = False
 ) -> None:
     """Run a recording through the core again and compare, bit for bit where the machine is the same.
 

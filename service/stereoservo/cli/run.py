@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, emit, log, shipped_or_path
 from stereoservo.messages.servo_state import COMMISSIONING_SPEED
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ def run(
 
     def ready(plan: RunPlan) -> None:
         mode = " (dry run: nothing is written to the drives)" if dry_run else ""
-        note(f"cell {plan.cell.cell.name!r} is up{mode}")
+        log(f"cell {plan.cell.cell.name!r} is up{mode}")
 
     path = shipped_or_path(cell)
     file = record if record in ("", "auto") else str(Path(record).absolute())

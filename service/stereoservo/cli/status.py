@@ -16,7 +16,7 @@ from stereoservo.daemon.heartbeat import GATEWAY_HANG_S, SERVO_HANG_S, Heartbeat
 from stereoservo.daemon.seqlock import SlotError, SlotReader
 from stereoservo.messages.compilation_progress import read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories
-from stereoservo.messages.discovery import find_daemon
+from stereoservo.messages.discovery import find_daemon, live_cells
 from stereoservo.messages.servo_state import STATE_LAYOUT, decode_state, read_run, state_message
 from stereoservo.messages.wire import EventMessage, StateMessage
 
@@ -257,3 +257,13 @@ def newest_state(directories: CellDirectories) -> StateMessage | None:
     alive = not servo_silence(directories)
     now_ns = time.monotonic_ns() if alive else state.status.t_ns
     return state_message(run, run.boot, state, now_ns=now_ns, servo_alive=alive, last_event=0)
+
+
+# -- cells of this host ----------------------------------------------------------------------------------------
+
+
+def ls(json: JsonOption = False) -> None:
+    """List the live cells of this user on this host."""
+    cells = live_cells()
+    text = "\n".join(f"{info.cell:24} process {info.pid:<8} {info.endpoint}  {info.cell_path}" for info in cells)
+    emit({"cells": cells}, text or "no live cell", json)

@@ -10,17 +10,7 @@ from typing import Annotated, Any
 import msgspec
 import typer
 
-from stereoservo.cli.output import (
-    CellArgument,
-    CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
-    emit,
-    marker_ids,
-    read_file,
-)
-from stereoservo.client import Client
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, marker_ids, read_file
 from stereoservo.messages.decoding import decoding
 from stereoservo.messages.wire import Synthesise, decode, encode
 
@@ -46,23 +36,21 @@ def teach(
             help='Make it from drawings, JSON: {"workpiece": {"10": [x, y, z]}, "tool": {"0": …}, "pose": 4x4}.',
         ),
     ] = None,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
+    options: CellOptions = CELL_OPTIONS,
 ) -> None:
     """Store what the cameras see now as a goal, with all other markers in view; or make one from drawings."""
     if drawing is not None:
         if tool is not None:
             raise CommandError("usage", "--tool goes with what the cameras see; in a drawing, its tool is named")
         request = read_drawing(drawing, name)
-        with Client(cell, endpoint=endpoint, operator=operator) as client:
+        with options.client(cell) as client:
             reply = client.synthesise(request)
-        emit(reply, reply.message, json)
+        options.emit(reply, reply.message)
         return
     markers = () if tool is None else tuple(marker_ids(tool, "--tool"))
-    with Client(cell, endpoint=endpoint, operator=operator) as client:
+    with options.client(cell) as client:
         event = client.teach(name, frames, tool=markers)
-    emit(event, event.message, json)
+    options.emit(event, event.message)
 
 
 def read_drawing(path: Path, name: str) -> Synthesise:

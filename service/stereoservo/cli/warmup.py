@@ -13,7 +13,7 @@ from typing import Annotated
 
 import typer
 
-from stereoservo.cli.output import CommandError, JsonOption, emit, note, shipped_or_path
+from stereoservo.cli.output import CommandError, JsonOption, emit, log, shipped_or_path
 from stereoservo.daemon.process_control import child_environment
 from stereoservo.messages.compilation_progress import CompilationProgress, read_progress
 from stereoservo.messages.directories import cell_directories
@@ -63,7 +63,7 @@ def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
             progress = read_progress(told)
         if progress != known:
             known = progress
-            note(f"compiling: {progress[0].words}")
+            log(f"compiling: {progress[0].words}")
 
 
 def _warm_up_detectors(cell: str) -> None:

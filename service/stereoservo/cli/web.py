@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from stereoservo.cli import interruption
-from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CommandError, EndpointOption, JsonOption, emit, log
 from stereoservo.messages.keys import InvalidKeyError, check_name
 
 if TYPE_CHECKING:
@@ -28,24 +28,20 @@ THREADS_S = 1.0
 
 def web(
     cell: Annotated[
-        str | None,
-        typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml)."),
+        str | None, typer.Argument(metavar="CELL", help="Name of a live cell, or path of a cell file (*.toml).")
     ] = None,
     flight: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell."),
+        Path | None, typer.Option(metavar="FILE", help="Show a flight recording (*.mcap) in the place of a live cell.")
     ] = None,
     port: Annotated[int, typer.Option(help="TCP port; 0: a free one.", min=0, max=65535)] = 8080,
     address: Annotated[str, typer.Option(help="Address to listen on; any but loopback needs --tls.")] = "127.0.0.1",
     tls: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address."),
+        Path | None, typer.Option(metavar="DIR", help="Directory with cert.pem and key.pem: https, on any address.")
     ] = None,
     host: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME",
-            help="Another name under which browsers reach the server (a cell.example); repeat.",
+            metavar="NAME", help="Another name under which browsers reach the server (a cell.example); repeat."
         ),
     ] = None,
     operate: Annotated[
@@ -84,22 +80,22 @@ def web(
         make_link = partial(FlightLink, flight)
     else:
         assert cell is not None
-        make_link = partial(CellLink, cell, endpoint, operate or "page", log=note)
+        make_link = partial(CellLink, cell, endpoint, operate or "page", log=log)
     tokens: list[str] = []
 
     def announce(token: str) -> None:
         tokens.append(token)
         if len(tokens) > 1 or not json:
-            note(f"token to command the arm as {operate}, good for one use: {token}")
+            log(f"token to command the arm as {operate}, good for one use: {token}")
 
     interruption.check()  # an interrupt that was lost while packages were imported
-    with interruption.ending(END_S) as ending:
+    with interruption.graceful_shutdown(END_S) as shutdown:
         server = PageServer(make_link, operate, announce)
-        asyncio.run(_serve(server, address, port, context, host or [], tokens, json, ending))
-        left = interruption.threads_left(THREADS_S)
+        asyncio.run(_serve(server, address, port, context, host or [], tokens, json, shutdown))
+        left = interruption.unfinished_threads(THREADS_S)
         if left:
-            note(f"ended without waiting for what does not answer: {', '.join(left)}")
-            interruption.leave(0)
+            log(f"ended without waiting for what does not answer: {', '.join(left)}")
+            interruption.exit_now(0)
 
 
 def _check_names(hosts: list[str], operator: str | None) -> None:
@@ -107,8 +103,7 @@ def _check_names(hosts: list[str], operator: str | None) -> None:
     for name in hosts:
         if not HOST_NAME.fullmatch(name):
             raise CommandError(
-                "usage",
-                f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port",
+                "usage", f"--host {name!r}: a name or address is valid, cell.example or 10.0.0.5, without a port"
             )
     if operator is not None:
         try:
@@ -125,7 +120,7 @@ async def _serve(
     names: list[str],
     tokens: list[str],
     as_json: bool,
-    ending: interruption.Ending,
+    shutdown: interruption.ShutdownRequest,
 ) -> None:
     ended = asyncio.Event()
     loop = asyncio.get_running_loop()
@@ -133,7 +128,7 @@ async def _serve(
     def wake() -> None:
         loop.call_soon_threadsafe(ended.set)
 
-    ending.wake = wake
+    shutdown.wake = wake
     try:
         found = await server.start(address, port, context, names)
     except OSError as error:
@@ -143,9 +138,9 @@ async def _serve(
         shown = f"[{address}]" if ":" in address else address
         url = f"{'http' if context is None else 'https'}://{shown}:{found}/"
         emit({"url": url, "token": tokens[-1] if tokens else None}, f"{url}  (Ctrl-C ends it)", as_json)
-        if not ending.asked:
+        if not shutdown.asked:
             await ended.wait()
-        note(
+        log(
             f"ending: pages are closed, and what they have started stops; by force after {END_S:g} s, or at once by a "
             "second Ctrl-C"
         )

@@ -13,17 +13,17 @@ is not a safety function in the sense of the standards: it limits commands, it d
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
+from msgspec.structs import force_setattr
 
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import NOT_MEASURED
 from stereoservo.core.ingest import TAKEN
-from stereoservo.core.settings import CoreSettings
+from stereoservo.core.settings import CoreSettings, MotionLimits
 from stereoservo.core.sources.progress import follow_error
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
@@ -199,29 +199,16 @@ class SafetyConfigurationError(ValueError):
         self.data = data
 
 
-@dataclass(frozen=True, eq=False)
-class SafetyLimits:
-    """The limits of the safety stage; all arrays in joint order, in [rad] or [m] and seconds.
+class SafetyLimits(MotionLimits, frozen=True, eq=False, dict=True, kw_only=True):
+    """The limits of the safety stage.
 
-    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box.
-    ``position_margin``: distance kept from the boxes and the ends of the position range.
-    ``coast_s``: how long a law may run on prediction [s].
     ``features_fresh_s``: age of the newest features up to which a law does not coast (one or two frames) [s]. The arm
-    brakes when the features are older than both.
+    brakes when the features are older than both this and ``coast_s``.
 
     Raises SafetyConfigurationError.
     """
 
     joint_names: tuple[str, ...]
-    position_min: FloatArray
-    position_max: FloatArray
-    velocity_max: FloatArray
-    acceleration_max: FloatArray
-    position_margin: float
-    keep_outs: FloatArray
-    keep_out_names: tuple[str, ...]
-    joint_timeout_s: float
-    coast_s: float
     features_fresh_s: float = 0.15
 
     @cached_property
@@ -246,9 +233,9 @@ class SafetyLimits:
                     name=name,
                     value=array.tolist(),
                 )
-            object.__setattr__(self, name, array)
+            force_setattr(self, name, array)
         boxes = np.ascontiguousarray(self.keep_outs, dtype=np.float64).reshape(-1, n, 2)
-        object.__setattr__(self, "keep_outs", boxes)
+        force_setattr(self, "keep_outs", boxes)
         for j, joint in enumerate(self.joint_names):
             if not self.position_min[j] + self.position_margin <= self.position_max[j] - self.position_margin:
                 raise SafetyConfigurationError(
@@ -373,20 +360,8 @@ def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
 
 def safety_limits(settings: CoreSettings, features_fresh_s: float) -> SafetyLimits:
     """The limits of a cell. Raises SafetyConfigurationError."""
-    limits = settings.limits
-    return SafetyLimits(
-        joint_names=settings.joint_names,
-        position_min=limits.position_min,
-        position_max=limits.position_max,
-        velocity_max=limits.velocity_max,
-        acceleration_max=limits.acceleration_max,
-        position_margin=limits.position_margin,
-        keep_outs=limits.keep_outs,
-        keep_out_names=limits.keep_out_names,
-        joint_timeout_s=limits.joint_timeout_s,
-        coast_s=limits.coast_s,
-        features_fresh_s=features_fresh_s,
-    )
+    shared = {name: getattr(settings.limits, name) for name in MotionLimits.__struct_fields__}
+    return SafetyLimits(**shared, joint_names=settings.joint_names, features_fresh_s=features_fresh_s)
 
 
 def _within(age_s: float, limit_s: float) -> bool:

@@ -45,10 +45,12 @@ class CameraSettings(msgspec.Struct, frozen=True):
     mobile: bool = False
 
 
-class LimitSettings(msgspec.Struct, frozen=True, eq=False):
-    """Limits in joint order: the tighter of drive and cell. ``keep_outs`` (k, n, 2) joint-space boxes.
+class MotionLimits(msgspec.Struct, frozen=True, eq=False):
+    """Limits of the motion; all arrays in joint order, in [rad] or [m] and seconds.
 
-    ``command_timeout_s``: without a command for so long, the drives stop on their own.
+    ``position_margin``: distance kept from the keep-outs and the ends of the position range.
+    ``keep_outs`` (k, n, 2): boxes (low, high) in joint space, ±inf where a joint does not bound the box.
+    ``coast_s``: how long a law may run on prediction [s].
     """
 
     position_min: FloatArray
@@ -60,6 +62,14 @@ class LimitSettings(msgspec.Struct, frozen=True, eq=False):
     keep_out_names: tuple[str, ...]
     coast_s: float
     joint_timeout_s: float
+
+
+class LimitSettings(MotionLimits, frozen=True, eq=False):
+    """Limits of a cell: the tighter of drive and cell file.
+
+    ``command_timeout_s``: without a command for so long, the drives stop on their own.
+    """
+
     speed_scale: float
     command_timeout_s: float = 0.1
 

@@ -89,11 +89,7 @@ def _per_image(cell: SyntheticCell, seed: int, progress: ProgressCall) -> list[d
         fit_model(trials, epoch=1)
         spent = time.process_time() - at
         rows.append(
-            {
-                "images": trials.images,
-                "fit_cpu_s": round(spent, 3),
-                "fit_ms_an_image": 1e3 * spent / trials.images,
-            }
+            {"images": trials.images, "fit_cpu_s": round(spent, 3), "fit_ms_an_image": 1e3 * spent / trials.images}
         )
         progress("cost an image", k + 1, len(IMAGES))
     return rows

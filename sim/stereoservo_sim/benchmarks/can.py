@@ -98,9 +98,7 @@ def _line(transport: str) -> Iterator[_Transport]:
     stock = transport.startswith("stock_")
     with peer("echo", transport.rpartition("_")[2]) as (_, channel):
         settings = ChannelSettings(
-            "slcan" if stock else "stereoservo_slcan",
-            channel,
-            interface_options=STOCK_OPTIONS if stock else {},
+            "slcan" if stock else "stereoservo_slcan", channel, interface_options=STOCK_OPTIONS if stock else {}
         )
         line = _Transport(settings, inline=False)
         try:
@@ -427,9 +425,4 @@ def run_can(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, An
     progress("can", len(TRANSPORTS) + 2, total)
     paced["on_a_grid"] = fastest_paced(PACED_RATES_HZ, PACED_S * repetitions)
     progress("can", total, total)
-    return {
-        "transports": transports,
-        "six_drives_over_tcp": drives,
-        "with_bit_times": paced,
-        "targets": TARGETS,
-    }
+    return {"transports": transports, "six_drives_over_tcp": drives, "with_bit_times": paced, "targets": TARGETS}

@@ -81,10 +81,7 @@ def serve_echo(kind: str) -> None:
         fd, slave = pty.openpty()
         tty.setraw(slave)
         print(os.ttyname(slave), flush=True)
-    with (
-        real_time(DRIVES_PRIORITY),
-        suppress(ConnectionError),
-    ):  # the host may disconnect before it has read everything
+    with real_time(DRIVES_PRIORITY), suppress(ConnectionError):  # the host may disconnect before it has read everything
         _answer_syncs(fd)
 
 

@@ -300,11 +300,7 @@ class _Tally:
 
 
 def robustness(
-    detector: DotDetector,
-    pictures: int,
-    seed: int,
-    progress: ProgressCall,
-    rows: dict[str, Conditions] = TESTED,
+    detector: DotDetector, pictures: int, seed: int, progress: ProgressCall, rows: dict[str, Conditions] = TESTED
 ) -> list[dict[str, Any]]:
     """A row for each of the conditions, by acquisition (no prior) and by tracking (a prior some 1 px off).
 
@@ -374,12 +370,7 @@ def tag_scene(rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
         printed = np.kron(TAG_BLACK + (TAG_WHITE - TAG_BLACK) * cells, np.ones((scale, scale))).astype(np.float32)
         from_print = np.array([[1, 0, 0.5 - scale], [0, 1, 0.5 - scale], [0, 0, n * scale]]) / (n * scale)
         cv2.warpPerspective(
-            printed,
-            to_fine @ H @ from_print,
-            fine.shape[::-1],
-            fine,
-            cv2.INTER_NEAREST,
-            cv2.BORDER_TRANSPARENT,
+            printed, to_fine @ H @ from_print, fine.shape[::-1], fine, cv2.INTER_NEAREST, cv2.BORDER_TRANSPARENT
         )
         square = np.array([[0.0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]]) @ H.T
         corners.append(square[:, :2] / square[:, 2:])

@@ -28,11 +28,7 @@ import numpy as np
 from stereoservo.client import Client, ClientError
 from stereoservo.daemon.pacing import CYCLE_BYTES, CYCLE_LOG_VARIABLE
 from stereoservo.kinematics.model import encode_model
-from stereoservo.messages.directories import (
-    CellDirectories,
-    cell_directories,
-    create_directories,
-)
+from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.wire import PreviewInfo
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.benchmarks.service_bench import directories_in, environment, processes_of, running_daemon
@@ -162,14 +158,7 @@ def _measured(folder: Path, live_log: Path, rate_hz: int, priority: int, repetit
         rows = cycles_of(live_log)
         live.append(rows[(rows[:, 0] > begin_ns) & (rows[:, 0] < end_ns)])
         log = new_log(folder / "empty.cycles")
-        program = [
-            sys.executable,
-            "-c",
-            EMPTY,
-            str(10**9 // rate_hz),
-            str(priority),
-            str(round(SEGMENT_S * rate_hz)),
-        ]
+        program = [sys.executable, "-c", EMPTY, str(10**9 // rate_hz), str(priority), str(round(SEGMENT_S * rate_hz))]
         subprocess.run(program, env={**os.environ, CYCLE_LOG_VARIABLE: str(log)}, check=True)
         empty.append(cycles_of(log))
     figures = {"live": _figures(np.concatenate(live)), "empty": _figures(np.concatenate(empty))}
@@ -332,10 +321,7 @@ def _segment(processes: dict[str, int]) -> dict[str, tuple[float, float]]:
     time.sleep(IDLE_SEGMENT_S)
     took_s, after = time.monotonic() - began_s, {name: spent_by(number) for name, number in processes.items()}
     return {
-        name: (
-            processor_share(before[name], after[name], took_s),
-            (after[name].runs - before[name].runs) / took_s,
-        )
+        name: (processor_share(before[name], after[name], took_s), (after[name].runs - before[name].runs) / took_s)
         for name in processes
     }
 
@@ -460,11 +446,7 @@ def ratios(pages: list[IntArray], none: list[IntArray], draws: np.random.Generat
     low, high = np.percentile(np.array(resampled), INTERVAL, axis=0)
     ratio = _levels(pages) / _levels(none)
     return {
-        name: {
-            "ratio": round(float(ratio[k]), 3),
-            "low": round(float(low[k]), 3),
-            "high": round(float(high[k]), 3),
-        }
+        name: {"ratio": round(float(ratio[k]), 3), "low": round(float(low[k]), 3), "high": round(float(high[k]), 3)}
         for k, name in enumerate(("p50", "p99"))
     }
 
@@ -565,11 +547,7 @@ def _watchers(sockets: Any, file: Path, watched: bool) -> Iterator[dict[str, int
         yield {}
         return
     program = [sys.executable, "-m", "stereoservo.cli.main", "watch", "demo"]
-    options = {
-        "terminal": [],
-        "foxglove": ["--foxglove", "--port", "0"],
-        "rerun": ["--rerun", "--save", str(file)],
-    }
+    options = {"terminal": [], "foxglove": ["--foxglove", "--port", "0"], "rerun": ["--rerun", "--save", str(file)]}
     with ExitStack() as ending:
         processes = {}
         for name, chosen in options.items():

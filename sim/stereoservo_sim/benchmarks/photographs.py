@@ -296,12 +296,7 @@ def _flow(median: ImageArray, places: FloatArray) -> Callable[[ImageArray], Foun
 
     def find(image: ImageArray) -> Found:
         pixels, status, _ = cv2.calcOpticalFlowPyrLK(
-            median,
-            image,
-            start,
-            start.copy(),
-            winSize=(2 * PATCH + 1,) * 2,
-            flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+            median, image, start, start.copy(), winSize=(2 * PATCH + 1,) * 2, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
         )
         return np.asarray(pixels, dtype=np.float64)[:, 0], status[:, 0] > 0
 
@@ -380,10 +375,7 @@ def dot_rows(paths: Sequence[Path], repetitions: int, seed: int) -> list[Row]:
         return np.asarray(centres, dtype=np.float64).reshape(-1, 2) if found else np.full((GRID**2, 2), np.nan)
 
     rows = []
-    for name, find, dots in (
-        ("dots (stereoservo)", ours, FACE.positions),
-        ("cv2.findCirclesGrid", grid, _grid()),
-    ):
+    for name, find, dots in (("dots (stereoservo)", ours, FACE.positions), ("cv2.findCirclesGrid", grid, _grid())):
         rng = np.random.default_rng(seed)
         made = [drawn(photograph, dots, rng) for photograph in photographs]
         seen, ms = over([image for image, _ in made], find, repetitions)

@@ -29,12 +29,7 @@ from stereoservo.client import Client, ClientError, SessionError
 from stereoservo.daemon.heartbeat import HeartbeatReader
 from stereoservo.daemon.seqlock import StopSlot
 from stereoservo.kinematics.model import encode_model
-from stereoservo.messages.directories import (
-    RUNTIME_VARIABLE,
-    STATE_VARIABLE,
-    CellDirectories,
-    cell_directories,
-)
+from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, CellDirectories, cell_directories
 from stereoservo.messages.discovery import DaemonError, DaemonInfo, DaemonProcess
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.emulated import ANY_PORT, move_to_channel
@@ -216,9 +211,9 @@ class ServiceBench:
         if self.daemon.process.poll() is not None:
             self.end_daemon()
             self.start()
-        self.asked(_operated)
+        self.query(_operated)
 
-    def asked(self, ask: Callable[[Client], T]) -> T:
+    def query(self, ask: Callable[[Client], T]) -> T:
         """The answer of a daemon whose gateway may be restarting. Raises ClientError, SessionError."""
         until = time.monotonic() + READY_S
         while True:
@@ -230,7 +225,7 @@ class ServiceBench:
                     raise
                 time.sleep(0.1)
 
-    def asked_ready(self, ask: Callable[[Client], T]) -> T:
+    def query_ready(self, ask: Callable[[Client], T]) -> T:
         """The answer of a cell that is made ready first, again if a stalled machine stopped it since."""
 
         def operated(client: Client) -> T:
@@ -238,9 +233,9 @@ class ServiceBench:
             return ask(client)
 
         self.ready()
-        return self.asked(operated)
+        return self.query(operated)
 
-    def forget_state(self) -> None:
+    def delete_state(self) -> None:
         """Remove the models and taught goals of a trial, and the disk they are on."""
         self.mounts.close()
         for path in (*self.directories.models.glob("*"), *self.directories.state.glob("taught.json*")):
@@ -309,11 +304,7 @@ def running_bench() -> Iterator[ServiceBench]:
 
 @contextmanager
 def running_daemon(
-    path: Path,
-    folder: Path,
-    options: tuple[str, ...] = (),
-    environ: dict[str, str] | None = None,
-    code: str = "daemon",
+    path: Path, folder: Path, options: tuple[str, ...] = (), environ: dict[str, str] | None = None, code: str = "daemon"
 ) -> Iterator[DaemonInfo]:
     """The running daemon of a cell file, with its directories in ``folder``; ``environ``: for its processes.
 

@@ -241,7 +241,7 @@ class _Soak:
             )
         if self.rng.random() > QUIET:
             self.cell.run_for(float(self.rng.uniform(0.0, 1.0)))
-            self._struck(law)
+            self._inject_fault(law)
         try:
             end = self.cell.wait_for(lambda e: e.id == identity and e.kind in TERMINAL, LIMIT_S + 5.0)
         except LockstepTimeoutError as error:
@@ -260,7 +260,7 @@ class _Soak:
         if end.kind == "goal_reached" and end.error_px is not None:
             self.residuals.append((passed_s / 3600.0, end.error_px))
 
-    def _struck(self, law: str) -> None:
+    def _inject_fault(self, law: str) -> None:
         """Inject a random fault; the arm rests, the cause is removed, and an operator continues."""
         name = list(FAULTS)[int(self.rng.integers(len(FAULTS)))]
         self.faults[name] += 1
@@ -271,11 +271,10 @@ class _Soak:
         _, fastest = self._true_motion()
         blind = name == "cameras dark" and law == "joints"  # which cameras do not affect
         if name == "encoder stuck":
-            self._creeps(before, law)
+            self._require_slow_creep(before, law)
         elif fastest > MOVING and not blind:
             raise ExperimentError(
-                "moves",
-                f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}",
+                "moves", f"{name}: the arm moves at {fastest:.3g} rad/s {RESTS_S:g} s after the fault, law {law}"
             )
         self.cell.joints.faults = type(self.cell.joints.faults)()  # type: ignore[attr-defined]
         for camera in self.cell.cameras:
@@ -290,7 +289,7 @@ class _Soak:
         assert newest is not None
         return newest[1], float(np.abs(newest[2]).max())
 
-    def _creeps(self, before: FloatArray, law: str) -> None:
+    def _require_slow_creep(self, before: FloatArray, law: str) -> None:
         """A slow command with a stuck encoder is detected by travel, not by time. Raises ExperimentError."""
         for _ in range(round(LIMIT_S / 0.5)):
             at, fastest = self._true_motion()
@@ -315,9 +314,9 @@ class _Soak:
         if self.cell.status.lifecycle != Lifecycle.ACTIVE:
             reasons = msgspec.to_builtins(self.cell.status.reasons)
             raise ExperimentError("not_active", f"after {name} the cell is {self.cell.status.lifecycle}: {reasons}")
-        self._seen_again(name)
+        self._await_agreement(name)
 
-    def _seen_again(self, name: str) -> None:
+    def _await_agreement(self, name: str) -> None:
         """Wait until the images agree with the joints: before, no goal by images is accepted."""
         for _ in range(round(LOOKS_S / 0.1)):
             assert self.cell.status is not None
@@ -421,7 +420,7 @@ def _killed(bench: ServiceBench, rng: np.random.Generator) -> Trial:
         end = -END if client.status().joints["j1"] > 0.0 else END
         client.goal({"j1": end}, speed_scale=SPEED_SCALE, lease_s=None)
 
-    bench.asked_ready(begin)
+    bench.query_ready(begin)
     begin_ns = time.monotonic_ns()
     time.sleep(float(rng.uniform(YOUNG_S + 0.3, 3.0)))
     processes = bench.processes()
@@ -516,8 +515,7 @@ class _LiveSoak:
         self.disk_mb: list[float] = []
         self.told: list[EventMessage] = []
         client.session.declare_subscriber(
-            client.keys.event,
-            lambda sample: self.told.append(decode(sample.payload.to_bytes(), EventMessage)),
+            client.keys.event, lambda sample: self.told.append(decode(sample.payload.to_bytes(), EventMessage))
         )
         self.acts: dict[str, Callable[[], object]] = {
             "stop slot": lambda: raise_stop_slot(bench),
@@ -541,7 +539,7 @@ class _LiveSoak:
             self.client.hold()
             time.sleep(HELD_S)
         finally:  # a hold may take effect even if its answer was late
-            self.bench.asked(lambda client: client.resume())
+            self.bench.query(lambda client: client.resume())
 
     def one_goal(self) -> None:
         """Send a goal, inject a fault into the daemon in half of the cases, and wait for its end. Raises

@@ -57,10 +57,7 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
     commands = _commands(repetitions, progress)
     with tempfile.TemporaryDirectory(prefix="stereoservo-startup-") as scratch:
         folder = Path(scratch)
-        variables = {
-            **directories_in(folder),
-            "NUMBA_CACHE_DIR": str(folder / "cache"),
-        }
+        variables = {**directories_in(folder), "NUMBA_CACHE_DIR": str(folder / "cache")}
         with environment(variables):
             starts = []
             for k, name in enumerate(("first", "second")):
@@ -91,10 +88,7 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
     text, log = folder / f"{name}.txt", folder / f"{name}.log"
     try:
         with DaemonProcess(
-            shipped_cell_path(CELLS[0]),
-            options=("--seed", str(seed)),
-            log=text,
-            environment={LOG_VARIABLE: str(log)},
+            shipped_cell_path(CELLS[0]), options=("--seed", str(seed)), log=text, environment={LOG_VARIABLE: str(log)}
         ) as daemon:
             info = daemon.wait_ready()
             ready = time.monotonic()

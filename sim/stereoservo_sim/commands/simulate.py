@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_args
@@ -79,49 +80,57 @@ Draw = Annotated[
 ]
 
 
-def simulate(
-    tasks: TaskFile = None,
-    arm: ArmChoice = ArmOption.FREE,
+@dataclass(frozen=True)
+class SimulateOptions:
+    """Options of the command; each field is one of the command line."""
+
+    tasks: TaskFile = None
+    arm: ArmChoice = ArmOption.FREE
     calibration: Annotated[
         CalibrationOption,
         typer.Option(
             help=f"self: learnt once from trial motions, {STOPS} stops a joint, {FRAMES} frames averaged at each; "
             "exact: from the truth; coarse: metric, with 10 % focal and 5° hand-eye error."
         ),
-    ] = CalibrationOption.SELF,
-    law: Annotated[LawOption, typer.Option(help="The law.")] = LAW,
-    jacobian: Annotated[JacobianOption, typer.Option(help="Of laws in the images.")] = JacobianOption.MEAN,
+    ] = CalibrationOption.SELF
+    law: Annotated[LawOption, typer.Option(help="The law.")] = LAW
+    jacobian: Annotated[JacobianOption, typer.Option(help="Of laws in the images.")] = JacobianOption.MEAN
     centre: Annotated[
         str, typer.Option(help="Point that goes straight: middle (of the markers), or a marker, 0 to 3.")
-    ] = "middle",
+    ] = "middle"
     points: Annotated[
         PointsOption, typer.Option(help="predicted by kinematics and corrected, or triangulated anew.")
-    ] = PointsOption.PREDICTED,
-    gain: Annotated[float, typer.Option(help="[1/s]")] = DEFAULT_GAIN,
-    rate: Annotated[float, typer.Option(help="Of the loop [Hz].")] = DEFAULT_RATE_HZ,
-    noise_px: Annotated[float, typer.Option(help="Standard deviation of each pixel coordinate [px].")] = 0.1,
-    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of everything random.")] = 0,
+    ] = PointsOption.PREDICTED
+    gain: Annotated[float, typer.Option(help="[1/s]")] = DEFAULT_GAIN
+    rate: Annotated[float, typer.Option(help="Of the loop [Hz].")] = DEFAULT_RATE_HZ
+    noise_px: Annotated[float, typer.Option(help="Standard deviation of each pixel coordinate [px].")] = 0.1
+    seed: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of everything random.")] = 0
     jobs: Annotated[
         int,
         typer.Option(min=0, max=256, help="Processes; the results do not depend on it [0: one a processor]."),
-    ] = 0,
+    ] = 0
     drop_camera: Annotated[
         str | None,
         typer.Option(metavar="START:SECONDS", help="The second camera is dropped for a time [s]."),
-    ] = None,
+    ] = None
     mechanics: Annotated[
         MechanicsChoice | None,
         typer.Option(help="Of the arm rx90: gears and encoders as such joints have them; docs/simulation.md."),
-    ] = None,
+    ] = None
     law_only: Annotated[
         bool,
         typer.Option(help="The law alone, without goal, monitors and safety stage; the arm free has no others."),
-    ] = False,
-    draw: Draw = None,
-    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
-    ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False,
-) -> None:
+    ] = False
+    draw: Draw = None
+    limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None
+    ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")] = False
+
+
+SIMULATE_OPTIONS = SimulateOptions()
+
+
+def simulate(given: SimulateOptions = SIMULATE_OPTIONS) -> None:
     """Run every task of a file in closed loop; the controller sees noisy pixels only, the judge the truth.
 
     The arms rx90 and twist are driven by the servo core, as in the daemon, the arm free by the law alone.
@@ -131,23 +140,23 @@ def simulate(
     from stereoservo_sim.tasks.closed_loop import LoopSettings
 
     settings = LoopSettings(
-        law=_usable(law),
-        arm=arm.value,
-        calibration=calibration.value,
-        jacobian=jacobian.value,
-        centre=_centre(centre),
-        points=points.value,
-        gain=_within("--gain", gain, 1e-3, 50.0),
-        rate_hz=_within("--rate", rate, 1.0, 10_000.0),
-        noise_px=_within("--noise-px", noise_px, 0.0, 100.0),
-        seed=seed,
-        drop_camera=_drop(drop_camera),
-        mechanics=_mechanics(mechanics, arm),
-        core=_by_core(arm, law_only, calibration, centre),
+        law=_usable(given.law),
+        arm=given.arm.value,
+        calibration=given.calibration.value,
+        jacobian=given.jacobian.value,
+        centre=_centre(given.centre),
+        points=given.points.value,
+        gain=_within("--gain", given.gain, 1e-3, 50.0),
+        rate_hz=_within("--rate", given.rate, 1.0, 10_000.0),
+        noise_px=_within("--noise-px", given.noise_px, 0.0, 100.0),
+        seed=given.seed,
+        drop_camera=_drop(given.drop_camera),
+        mechanics=_mechanics(given.mechanics, given.arm),
+        core=_by_core(given.arm, given.law_only, given.calibration, given.centre),
     )
-    answer = _answer(_given(tasks, draw, seed), limit, ids, settings, jobs)
-    answer = {"file": None if tasks is None else str(tasks), "draw": draw, **answer}
-    if as_json:
+    answer = _answer(_given(given.tasks, given.draw, given.seed), given.limit, given.ids, settings, given.jobs)
+    answer = {"file": None if given.tasks is None else str(given.tasks), "draw": given.draw, **answer}
+    if given.as_json:
         sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
     else:
         _show(answer, Console(markup=False, highlight=False))

@@ -107,14 +107,25 @@ class Verb:
         return fields
 
 
+def _text_verb(name: str, meaning: str, lines: Callable[[Any], list[str]]) -> Verb:
+    """A verb that answers with lines of text, and changes nothing."""
+    return Verb(name, meaning, lambda emulator, command: "\n".join(lines(emulator)), logged=False)
+
+
 class FaultLanguage(Generic[Command]):
-    """The verbs of an emulator, and the type of its commands. ``example`` (a command that may last) and ``note`` appear
-    in the help.
+    """The verbs of an emulator, with ``status`` of its ``devices`` and ``help``, and the type of its commands.
+    ``example`` (a command that may last) and ``note`` appear in the help.
     """
 
-    def __init__(self, command: type[Command], verbs: Mapping[str, Verb], *, example: str, note: str = "") -> None:
+    def __init__(
+        self, command: type[Command], verbs: Mapping[str, Verb], *, devices: str, example: str, note: str = ""
+    ) -> None:
         self._command = command
-        self.verbs = dict(verbs)
+        self.verbs = {
+            **verbs,
+            "status": _text_verb("status", f"the state of all {devices}", lambda emulator: emulator.status()),
+            "help": _text_verb("help", "this list", lambda emulator: self.help_lines()),
+        }
         self._example = example
         self._note = note
 

@@ -28,7 +28,7 @@ from stereoservo.ports.devices import Detector, Frame
 from stereoservo_drivers.detectors.aruco import TagDetector
 from stereoservo_drivers.detectors.dots import DotDetector
 from stereoservo_drivers.detectors.patch_alignment import ReferencePatches, build_pyramid
-from stereoservo_drivers.edges.detector import EdgeDetector
+from stereoservo_drivers.edges import EdgeDetector
 from stereoservo_sim.benchmarks.features import DICTIONARY, TAG_COLUMNS, TAG_NOISE, TAG_ROWS, tag_scene
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepRefusalError

@@ -33,7 +33,7 @@ from stereoservo.messages.goals import TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import Detector, Frame
 from stereoservo_drivers.detectors.dots import DotDetector
-from stereoservo_drivers.edges.detector import EdgeDetector
+from stereoservo_drivers.edges import EdgeDetector
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator, LockstepRefusalError
 from stereoservo_sim.experiments.experiment import cases

@@ -36,12 +36,7 @@ class TrueJointHistory:
     """
 
     def __init__(
-        self,
-        buffer: mmap.mmap | bytearray,
-        joints: int,
-        capacity: int,
-        path: Path | None = None,
-        inode: int = 0,
+        self, buffer: mmap.mmap | bytearray, joints: int, capacity: int, path: Path | None = None, inode: int = 0
     ) -> None:
         self.joints = joints
         self.capacity = capacity

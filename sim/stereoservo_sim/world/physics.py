@@ -132,12 +132,7 @@ class PybulletPlant(RigidPlant):
         self._loaded, self._arm, self._joints = loaded, loaded.body, loaded.joints
         for joint in loaded.moving:
             self._bullet.changeDynamics(
-                self._arm,
-                joint,
-                linearDamping=0,
-                angularDamping=0,
-                jointDamping=0,
-                physicsClientId=self._client,
+                self._arm, joint, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self._client
             )
         self._places = [loaded.moving.index(joint) for joint in loaded.joints]
         for joint, rest in loaded.beside.items():

@@ -150,13 +150,7 @@ def _numbers(values: FloatArray) -> str:
 def roll_pitch_yaw(pose: FloatArray) -> FloatArray:
     """Angles (3,) [rad] about the fixed axes x, y, z, in this order, of the rotation of a pose (4, 4)."""
     R = pose[:3, :3]
-    return np.array(
-        [
-            np.arctan2(R[2, 1], R[2, 2]),
-            -np.arcsin(np.clip(R[2, 0], -1, 1)),
-            np.arctan2(R[1, 0], R[0, 0]),
-        ]
-    )
+    return np.array([np.arctan2(R[2, 1], R[2, 2]), -np.arcsin(np.clip(R[2, 0], -1, 1)), np.arctan2(R[1, 0], R[0, 0])])
 
 
 def _origin(pose: FloatArray) -> str:

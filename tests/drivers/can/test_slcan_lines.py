@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
 from stereoservo_drivers.can.slcan_lines import (
     BEL,

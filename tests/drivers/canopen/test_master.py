@@ -136,7 +136,7 @@ def test_the_first_fault_stands_and_later_ones_are_kept(bus) -> None:
     bus.codec.pending += [AxisFault(1, "emergency", "second"), AxisFault(1, "emergency", "again")]
     bus.cycle()
     assert bus.master.fault.message == "joint 'j1': first"
-    assert [fault.message for fault in bus.master.also] == ["joint 'j2': second"]
+    assert [fault.message for fault in bus.master.later_faults] == ["joint 'j2': second"]
 
 
 def test_what_a_reset_itself_provoked_does_not_latch_again(bus) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.monitors import LatenessMonitor
+from stereoservo_drivers.canopen.master import LatenessMonitor
 
 MS = 1_000_000
 

@@ -13,8 +13,7 @@ import pytest
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC
-from stereoservo_drivers.canopen.odrive import OdriveCodec
-from stereoservo_drivers.canopen.odrive_bringup import OdriveBringup
+from stereoservo_drivers.canopen.odrive import OdriveBringup, OdriveCodec
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 
 MS = 1_000_000

@@ -12,8 +12,7 @@ import pytest
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import DriverContext, DriverError, Frame, Prior
 from stereoservo_drivers.contracts import DetectorContract
-from stereoservo_drivers.edges.detector import EdgeDetector, load_part
-from stereoservo_drivers.edges.line_measurement import crossing, measure_lines, take_profiles
+from stereoservo_drivers.edges import EdgeDetector, crossing, load_part, measure_lines, take_profiles
 from stereoservo_sim.world.body import part_text
 from stereoservo_sim.world.rendering import Renderer, RenderSettings
 from stereoservo_sim.world.simulated_cell import DEMO_GOALS, solid_cell

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_drivers.kit.device_clock import DeviceClock
+from stereoservo_drivers.kit.timing import DeviceClock
 
 PERIOD_S, FASTEST_S, LATEST_S = 0.008, 0.0003, 0.009
 

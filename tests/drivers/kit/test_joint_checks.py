@@ -16,7 +16,7 @@ from stereoservo_drivers.commands.driver_check import driver_check
 from stereoservo_drivers.kit import joint_checks
 from stereoservo_drivers.kit.bench import RUNAWAY_REMEDY, CheckFailedError, JointBench
 from stereoservo_drivers.kit.joint_checks import JOINT_CHECKS, STALL_S, TRIES, JointCheck, run_check
-from stereoservo_drivers.kit.watchdog import CommandWatchdog, StallWatch
+from stereoservo_drivers.kit.timing import CommandWatchdog, StallWatch
 
 from .faulty_drivers import (
     FAULTY,

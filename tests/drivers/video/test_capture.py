@@ -20,8 +20,8 @@ from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.video import sources
 from stereoservo_drivers.video.driver import Reader
 from stereoservo_drivers.video.options import Place, VideoOptions
+from stereoservo_drivers.video.pictures import StreamMonitor
 from stereoservo_drivers.video.sources import CaptureSource, SourcePicture
-from stereoservo_drivers.video.stream_monitor import Watch
 
 from .conftest import HEIGHT, WIDTH, number_of, picture, poll_until
 
@@ -45,7 +45,7 @@ def test_a_stream_through_opencv_gives_pictures_until_it_breaks(server):
     """What RTSP goes through, on a protocol that can be served here."""
     place = Place("rtsp", server.url, url=urlsplit(server.url))
     wanted = options(read_timeout_s=5.0, rate_hz=100.0)
-    reader = Reader(CaptureSource(place, wanted, MonotonicClock()), place, wanted, "left", Watch(100.0))
+    reader = Reader(CaptureSource(place, wanted, MonotonicClock()), place, wanted, "left", StreamMonitor(100.0))
     try:
         reader.open()
         numbers = []
@@ -345,7 +345,7 @@ class Hanging:
 @pytest.mark.parametrize("hang_in_open", [False, True])
 def test_a_thread_that_hangs_is_abandoned_and_what_it_gets_late_is_not_delivered(hang_in_open, monkeypatch):
     monkeypatch.setattr("stereoservo_drivers.video.driver.JOIN_S", 0.05)
-    source, watch = Hanging(hang_in_open), Watch(30.0)
+    source, watch = Hanging(hang_in_open), StreamMonitor(30.0)
     place = Place("device", "/dev/video0", device=0)
     reader = Reader(source, place, options(open_timeout_s=0.05), "left", watch)
     if hang_in_open:
@@ -377,7 +377,7 @@ def test_pictures_of_one_time_stay_in_order():
 
     source.read, source.interrupt = read, step.release
     place = Place("device", "/dev/video0", device=0)
-    reader = Reader(source, place, options(read_timeout_s=30.0), "left", Watch(30.0))
+    reader = Reader(source, place, options(read_timeout_s=30.0), "left", StreamMonitor(30.0))
     step.release()
     reader.open()
     frames = [reader.take()]
@@ -396,7 +396,7 @@ def test_a_bug_in_a_source_is_told_and_not_silent(monkeypatch):
     source = Hanging()
     source.read = lambda: 1 // 0
     place = Place("device", "/dev/video0", device=0)
-    reader = Reader(source, place, options(), "left", Watch(30.0))
+    reader = Reader(source, place, options(), "left", StreamMonitor(30.0))
     with pytest.raises(DriverError) as caught:
         reader.open()
     assert caught.value.code == "reader"

@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereoservo_drivers.video.stream_monitor import Watch
+from stereoservo_drivers.video.pictures import StreamMonitor
 
 MS = 1_000_000
 
@@ -18,7 +18,7 @@ def image(value):
 @settings(max_examples=40)
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=30))
 def test_gaps_of_the_sources_numbers_are_dropped_frames(steps):
-    watch = Watch(30.0)
+    watch = StreamMonitor(30.0)
     numbers = []
     seq = 17
     for k, step in enumerate(steps):
@@ -32,7 +32,7 @@ def test_gaps_of_the_sources_numbers_are_dropped_frames(steps):
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.integers(1, 5), st.floats(-0.2, 0.2)), min_size=2, max_size=30))
 def test_without_numbers_the_grid_tells(steps):
-    watch = Watch(50.0)
+    watch = StreamMonitor(50.0)
     slot = 0
     for k, (step, jitter) in enumerate(steps):
         slot += step
@@ -42,7 +42,7 @@ def test_without_numbers_the_grid_tells(steps):
 
 
 def test_a_late_picture_is_not_a_lost_one():
-    watch = Watch(100.0)
+    watch = StreamMonitor(100.0)
     for k, t_ms in enumerate((0, 10, 26, 30, 40)):
         watch.see(image(k), t_ms * MS, None, 0, look=True)
     assert watch.dropped == 0
@@ -50,21 +50,21 @@ def test_a_late_picture_is_not_a_lost_one():
 
 
 def test_pictures_that_were_passed_over_are_not_missing():
-    watch = Watch(100.0)
+    watch = StreamMonitor(100.0)
     watch.see(image(0), 0, 5, 0, look=True)
     watch.see(image(1), 40 * MS, 9, 3, look=True)
     assert (watch.dropped, watch.frames, watch.number) == (0, 5, 4)
 
 
 def test_a_source_that_counts_anew_goes_on():
-    watch = Watch(100.0)
+    watch = StreamMonitor(100.0)
     for k, seq in enumerate((500, 501, 0, 1)):
         assert watch.see(image(k), k * 10 * MS, seq, 0, look=True)
     assert (watch.number, watch.dropped) == (3, 0)
 
 
 def test_equal_pictures_are_withheld_from_the_first_on_and_over_reconnections():
-    watch = Watch(100.0)
+    watch = StreamMonitor(100.0)
     assert watch.see(image(1), 0, None, 0, look=True)
     assert not watch.see(image(1), 10 * MS, None, 0, look=True)
     watch.begin()
@@ -77,7 +77,7 @@ def test_equal_pictures_are_withheld_from_the_first_on_and_over_reconnections():
 
 
 def test_a_number_that_came_before_is_a_repetition_whatever_the_picture():
-    watch = Watch(100.0)
+    watch = StreamMonitor(100.0)
     assert watch.see(image(1), 0, 7, 0, look=False)
     assert not watch.see(image(2), 10 * MS, 7, 0, look=False)
     assert watch.frozen == 1

@@ -1,4 +1,4 @@
-"""`stereoservo bench faults`: its rows and tables. The faults themselves are tested in drives/test_fault_table.py."""
+"""`stereoservo bench faults`: its rows and tables. The faults are tested in emulators/bus/test_fault_table.py."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from rich.console import Console
 
 from stereoservo.cli import main as cli
 from stereoservo_sim.benchmarks.faults import bench, inputs, service
-from stereoservo_sim.benchmarks.faults.page import distinct_sentences, reliability_page
-from stereoservo_sim.emulators.bus.fault_cases import ODRIVE_CASES, FaultCase
+from stereoservo_sim.benchmarks.faults.bench import distinct_sentences, reliability_page
+from stereoservo_sim.emulators.bus.fault_trials import ODRIVE_CASES, FaultCase
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_where_nothing_may_be_mounted_the_trials_are_void_with_the_reason(tmp_pa
     with ExitStack() as mounts:
         bench = SimpleNamespace(
             folder=tmp_path, directories=SimpleNamespace(state=tmp_path / "s"), mounts=mounts, lasting=ExitStack(),
-            goals=[], end_daemon=lambda: None, forget_state=lambda: None,
+            goals=[], end_daemon=lambda: None, delete_state=lambda: None,
         )  # fmt: skip
         row = service._row(bench, next(fault for fault in service.FAULTS if fault.disk is disk), 3)
     assert (row["trials"], row["within"], row["rest_ms"]) == (0, 0, None)

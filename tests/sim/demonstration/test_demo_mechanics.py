@@ -9,7 +9,7 @@ import pytest
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.emulated import with_mechanics
-from stereoservo_sim.world.arms.urdf_file import urdf_path
+from stereoservo_sim.world.arms.arm_cell import urdf_path
 
 
 @pytest.mark.parametrize("name", CELLS)

@@ -7,6 +7,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,15 +18,14 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from stereoservo.cli import interruption
 from stereoservo.cli.output import (
+    CELL_OPTIONS,
     EXIT_FAILED,
+    CellOptions,
     CommandError,
-    EndpointOption,
-    JsonOption,
-    OperatorOption,
     cells_beginning,
     emit,
-    note,
-    note_hold,
+    log,
+    log_hold,
 )
 from stereoservo.client import Client, FailedError
 from stereoservo.messages.check_report import CheckReport, ZeroReset
@@ -36,201 +36,180 @@ from stereoservo.messages.wire import CalibrationResult, EventMessage
 TRIALS_SHARE = 0.9
 SHOWN_CHECKS = 8
 
-CheckOption = Annotated[bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")]
-ResetZerosOption = Annotated[
-    bool,
-    typer.Option(
-        "--reset-zeros",
-        help="With --check: where joint zeros have drifted, and nothing else, a new model with moved zeros.",
-    ),
-]
-UnattendedOption = Annotated[
-    bool,
-    typer.Option(
-        "--unattended",
-        help="With --check, for timers: enable nothing, disturb nobody; exit code 1 where the model does not hold.",
-    ),
-]
-UndoOption = Annotated[
-    bool,
-    typer.Option(
-        "--undo-refinement",
-        help="The calibrated model again, in place of one refined from it on-line; nothing moves.",
-    ),
-]
-TrialsOption = Annotated[
-    Path | None,
-    typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves."),
-]
-ImagesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--images",
-        metavar="DIR",
-        help="Fit trial motions recorded by `record --images`, with the cell file's detectors; nothing moves.",
-    ),
-]
-LinesOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--lines",
-        metavar="FILE.csv",
-        help="With --trials: pixels along straight lines (camera,line,u,v) that show the lens.",
-    ),
-]
-LinesSigmaOption = Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")]
-EnableOption = Annotated[
-    bool,
-    typer.Option("--enable", help="Switch the drives on first; else a cell whose drives are off is left alone."),
-]
-OutputOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--output",
-        metavar="FILE.json",
-        help="With --trials, --images: where the model goes; with --rig: the cameras (default: rig.json).",
-    ),
-]
-RigOption = Annotated[
-    bool,
-    typer.Option(
-        "--rig",
-        help="Calibrate the cameras without an arm, by a body that is waved by hand: CELL.toml's cameras live, or "
-        "--images of a recording, or of a folder a camera with pictures of one name for one place.",
-    ),
-]
-BoardOption = Annotated[
-    str,
-    typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6."),
-]
-PitchOption = Annotated[
-    float | None, typer.Option("--pitch", metavar="METRES", help="With --board: distance of its corners [m].")
-]
-LayoutOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--layout",
-        metavar="FILE.csv",
-        help="With --rig: id,x,y [m] of a flat body's markers, where measured.",
-    ),
-]
-LengthOption = Annotated[
-    str,
-    typer.Option(
-        "--length",
-        metavar="ID,ID=METRES",
-        help="With --rig: distance of two markers of a body of unknown layout.",
-    ),
-]
-SecondsOption = Annotated[float, typer.Option("--seconds", help="With --rig, live: how long to watch [s].")]
-RigCellArgument = Annotated[
-    str,
-    typer.Argument(
-        metavar="CELL",
-        help="Name of a live cell, or path of a cell file (*.toml); none with --rig and --board.",
-        autocompletion=cells_beginning,
-    ),
-]
+
+@dataclass(frozen=True)
+class CalibrateOptions:
+    """What is calibrated or checked, and from which data, as options of the command line."""
+
+    cell: Annotated[
+        str,
+        typer.Argument(
+            metavar="CELL",
+            help="Name of a live cell, or path of a cell file (*.toml); none with --rig and --board.",
+            autocompletion=cells_beginning,
+        ),
+    ] = ""
+    check: Annotated[bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")] = (
+        False
+    )
+    reset_zeros: Annotated[
+        bool,
+        typer.Option(
+            "--reset-zeros",
+            help="With --check: where joint zeros have drifted, and nothing else, a new model with moved zeros.",
+        ),
+    ] = False
+    unattended: Annotated[
+        bool,
+        typer.Option(
+            "--unattended",
+            help="With --check, for timers: enable nothing, disturb nobody; exit code 1 where the model does not hold.",
+        ),
+    ] = False
+    undo_refinement: Annotated[
+        bool,
+        typer.Option(
+            "--undo-refinement",
+            help="The calibrated model again, in place of one refined from it on-line; nothing moves.",
+        ),
+    ] = False
+    trials: Annotated[
+        Path | None, typer.Option("--trials", metavar="FILE.npz", help="Fit stored trial data again; nothing moves.")
+    ] = None
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            "--images",
+            metavar="DIR",
+            help="Fit trial motions recorded by `record --images`, with the cell file's detectors; nothing moves.",
+        ),
+    ] = None
+    lines: Annotated[
+        Path | None,
+        typer.Option(
+            "--lines",
+            metavar="FILE.csv",
+            help="With --trials: pixels along straight lines (camera,line,u,v) that show the lens.",
+        ),
+    ] = None
+    lines_sigma: Annotated[float, typer.Option(help="Noise of the pixels along lines [px].")] = 0.3
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output",
+            metavar="FILE.json",
+            help="With --trials, --images: where the model goes; with --rig: the cameras (default: rig.json).",
+        ),
+    ] = None
+    enable: Annotated[
+        bool,
+        typer.Option("--enable", help="Switch the drives on first; else a cell whose drives are off is left alone."),
+    ] = False
+    rig: Annotated[
+        bool,
+        typer.Option(
+            "--rig",
+            help="Calibrate the cameras without an arm, by a body that is waved by hand: CELL.toml's cameras live, or "
+            "--images of a recording, or of a folder a camera with pictures of one name for one place.",
+        ),
+    ] = False
+    board: Annotated[
+        str, typer.Option("--board", metavar="COLUMNSxROWS", help="With --rig: inner corners of a chessboard, 9x6.")
+    ] = ""
+    pitch: Annotated[
+        float | None, typer.Option("--pitch", metavar="METRES", help="With --board: distance of its corners [m].")
+    ] = None
+    layout: Annotated[
+        Path | None,
+        typer.Option(
+            "--layout", metavar="FILE.csv", help="With --rig: id,x,y [m] of a flat body's markers, where measured."
+        ),
+    ] = None
+    length: Annotated[
+        str,
+        typer.Option(
+            "--length", metavar="ID,ID=METRES", help="With --rig: distance of two markers of a body of unknown layout."
+        ),
+    ] = ""
+    seconds: Annotated[float, typer.Option("--seconds", help="With --rig, live: how long to watch [s].")] = 60.0
 
 
-def calibrate(
-    cell: RigCellArgument = "",
-    check: CheckOption = False,
-    reset_zeros: ResetZerosOption = False,
-    unattended: UnattendedOption = False,
-    undo_refinement: UndoOption = False,
-    trials: TrialsOption = None,
-    images: ImagesOption = None,
-    lines: LinesOption = None,
-    lines_sigma: LinesSigmaOption = 0.3,
-    output: OutputOption = None,
-    enable: EnableOption = False,
-    rig: RigOption = False,
-    board: BoardOption = "",
-    pitch: PitchOption = None,
-    layout: LayoutOption = None,
-    length: LengthOption = "",
-    seconds: SecondsOption = 60.0,
-    endpoint: EndpointOption = None,
-    operator: OperatorOption = None,
-    json: JsonOption = False,
-) -> None:
+CALIBRATE_OPTIONS = CalibrateOptions()
+
+
+def calibrate(given: CalibrateOptions = CALIBRATE_OPTIONS, options: CellOptions = CELL_OPTIONS) -> None:
     """Move each joint alone, watch the markers, fit the cell's model. Ctrl-C stops the arm.
 
     With the path of a cell file and no daemon running, one is started for the time of it, and its drives are switched
     on. Of a daemon that runs, a person has enabled the drives before, or gives ``--enable``. With ``--rig`` no arm is
     needed, and nothing moves.
     """
-    if rig:
-        from stereoservo.cli.calibrate.rig import RigOptions, calibrate_cameras  # imports OpenCV and more
+    cell, trials, images = given.cell, given.trials, given.images
+    if given.rig:
+        from stereoservo.cli.calibrate.rig import calibrate_cameras  # imports OpenCV and more
 
-        report, text = calibrate_cameras(RigOptions(cell, images, board, pitch, layout, length, seconds, output))
-        emit(report, text, json)
+        options.emit(*calibrate_cameras(given))
         return
-    if board or pitch is not None or layout is not None or length:
+    if given.board or given.pitch is not None or given.layout is not None or given.length:
         raise CommandError("argument", "--board, --pitch, --layout and --length go with --rig")
     if not cell:
         raise typer.BadParameter("CELL is needed, but for --rig with pictures of a board", param_hint="CELL")
-    if undo_refinement:
-        if check or trials is not None or images is not None:
+    if given.undo_refinement:
+        if given.check or trials is not None or images is not None:
             raise CommandError("argument", "--undo-refinement goes with no other option")
-        with Client(cell, endpoint=endpoint, operator=operator) as client:
+        with options.client(cell) as client:
             reply = client.undo_refinement()
-        emit(msgspec.to_builtins(reply), reply.message, json)
+        options.emit(msgspec.to_builtins(reply), reply.message)
         return
-    if (reset_zeros or unattended) and not check:
+    if (given.reset_zeros or given.unattended) and not given.check:
         raise CommandError("argument", "--reset-zeros and --unattended go with --check")
-    if (trials is not None or images is not None) and check:
+    if (trials is not None or images is not None) and given.check:
         raise CommandError("argument", "--check moves the arm, --trials and --images do not: give one of them")
     if trials is not None and images is not None:
         raise CommandError("argument", "--trials and --images: one of them")
     if images is not None:
-        if lines is not None:
+        if given.lines is not None:
             raise CommandError("argument", "--lines go with --trials; --images keeps its trial data for that")
         from stereoservo.cli.calibrate.stored_trials import fit_images, source_of_images  # imports OpenCV and more
 
-        from_images = fit_images(cell, images, output)
-        emit(from_images, f"{_table(from_images)}\n{source_of_images(from_images)}", json)
+        from_images = fit_images(cell, images, given.output)
+        options.emit(from_images, f"{_table(from_images)}\n{source_of_images(from_images)}")
         return
     if trials is not None:
         from stereoservo.cli.calibrate.stored_trials import fit_stored_trials, source_of_stored
 
-        result = fit_stored_trials(cell, trials, lines, lines_sigma, output)
-        emit(result, f"{_table(result)}\n{source_of_stored(result)}", json)
+        result = fit_stored_trials(cell, trials, given.lines, given.lines_sigma, given.output)
+        options.emit(result, f"{_table(result)}\n{source_of_stored(result)}")
         return
-    if lines is not None or output is not None:
+    if given.lines is not None or given.output is not None:
         raise CommandError("argument", "--lines and --output go with --trials FILE.npz, --output with --images too")
-    _calibrate_live(cell, check, reset_zeros, unattended, enable, endpoint, operator, json)
+    _calibrate_live(given, options)
 
 
-def _calibrate_live(
-    cell: str, check: bool, reset_zeros: bool, unattended: bool, enable: bool, endpoint: str | None,
-    operator: str | None, json: bool,
-) -> None:  # fmt: skip
+def _calibrate_live(given: CalibrateOptions, options: CellOptions) -> None:
     """Calibrate or check the cell's model by motions of the arm, and print the result."""
+    enable = given.enable
     with ExitStack() as stack:
-        if not unattended and endpoint is None and cell.endswith(".toml"):
+        if not given.unattended and options.endpoint is None and given.cell.endswith(".toml"):
             try:
-                find_daemon(cell)
+                find_daemon(given.cell)
             except NotRunningError:
-                note("no daemon runs for this cell: starting one, and switching the drives on")
+                log("no daemon runs for this cell: starting one, and switching the drives on")
                 enable = True
-                stack.enter_context(DaemonProcess(Path(cell))).wait_ready()
-        client = stack.enter_context(
-            Client(cell, endpoint=endpoint, operator=operator, while_waiting=interruption.check)
-        )
-        if unattended:
+                stack.enter_context(DaemonProcess(Path(given.cell))).wait_ready()
+        client = stack.enter_context(options.client(given.cell, interruption.check))
+        if given.unattended:
             _must_be_idle(client)
         else:
             _enabled(client, enable)
         try:
-            if reset_zeros:
-                _reset_zeros(client, json)
+            if given.reset_zeros:
+                _reset_zeros(client, options.json)
                 return
-            if check:
+            if given.check:
                 report = _with_bar(client, "check motion", client.check_model)
-                _print_check(report, client.cell, endpoint, json)
-                if unattended and report.status == "recalibrate":
+                _print_check(report, client.cell, options.endpoint, options.json)
+                if given.unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)
                 return
             result = _with_bar(client, "trial motions", lambda progress: client.calibrate(progress, report=True))
@@ -239,7 +218,7 @@ def _calibrate_live(
             raise
         except FailedError as error:
             raise _failure(error) from error
-    emit(result, _table(result), json)
+    options.emit(result, _table(result))
 
 
 def _table(result: CalibrationResult) -> str:
@@ -304,12 +283,7 @@ def _with_bar(client: Client, what: str, run: Any) -> Any:
         return run(_telling(client.cell, _lines(what)))
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=1.0)
-        return run(
-            _telling(
-                client.cell,
-                lambda done, told: bar.update(task, completed=done, description=told or what),
-            )
-        )
+        return run(_telling(client.cell, lambda done, told: bar.update(task, completed=done, description=told or what)))
 
 
 def _lines(what: str) -> Callable[[float, str], None]:
@@ -320,7 +294,7 @@ def _lines(what: str) -> Callable[[float, str], None]:
         nonlocal said
         if int(10 * done) > said:
             said = int(10 * done)
-            note(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
+            log(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
 
     return tell
 
@@ -329,9 +303,9 @@ def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMe
     """Event handler that passes progress, 0 to 1 with its message, to ``tell``, and prints warnings and holds."""
 
     def progress(event: EventMessage) -> None:
-        note_hold(event.kind, event.message, cell)
+        log_hold(event.kind, event.message, cell)
         if event.kind == "warning" or (event.kind == "calibration_report" and event.accepted is False):
-            note(event.message)
+            log(event.message)
         if event.progress is None:
             return
         fitting = event.kind.startswith("fit")

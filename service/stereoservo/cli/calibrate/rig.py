@@ -9,7 +9,7 @@ import time
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import msgspec
@@ -25,8 +25,9 @@ from stereoservo.calibration.camera_rig.rig_calibration import (
 )
 from stereoservo.calibration.camera_rig.views import RigViews, still_places
 from stereoservo.calibration.trial_data import TrialCamera
+from stereoservo.cli.calibrate.command import CalibrateOptions
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
-from stereoservo.cli.output import CommandError, note, shipped_or_path
+from stereoservo.cli.output import CommandError, log, shipped_or_path
 from stereoservo.daemon.camera_setup import recorded_camera, video_of
 from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
 from stereoservo.messages.cell_file import load_cell_file
@@ -41,19 +42,6 @@ from stereoservo.ports.devices import CameraObservation, Detector, DriverContext
 PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm")
 DEFAULT_OUTPUT = Path("rig.json")
 SHOWN_VIEWS, SHOWN_ADVICE = 3, 3
-
-
-class RigOptions(NamedTuple):
-    """Options of ``calibrate --rig`` as they were given."""
-
-    cell: str
-    images: Path | None
-    board: str
-    pitch: float | None
-    layout: Path | None
-    length: str
-    seconds: float
-    output: Path | None
 
 
 class RigReport(msgspec.Struct, frozen=True):
@@ -72,7 +60,7 @@ class RigReport(msgspec.Struct, frozen=True):
     file: str
 
 
-def calibrate_cameras(options: RigOptions) -> tuple[RigReport, str]:
+def calibrate_cameras(options: CalibrateOptions) -> tuple[RigReport, str]:
     """The report of a calibration, as tree and as text; the file is written.
 
     Raises CommandError, CalibrationError, and what cameras, recordings and cell files raise.
@@ -110,7 +98,7 @@ def _board(text: str, pitch: float | None) -> tuple[int, int] | None:
     return int(columns), int(rows)
 
 
-def _layout(options: RigOptions, board: tuple[int, int] | None, ids: tuple[int, ...]) -> FloatArray | None:
+def _layout(options: CalibrateOptions, board: tuple[int, int] | None, ids: tuple[int, ...]) -> FloatArray | None:
     """Positions (m, 3) [m] of the markers ``ids`` on the body, if they are stated."""
     if board is not None:
         assert options.pitch is not None
@@ -146,7 +134,7 @@ def _known(text: str, layout: FloatArray | None) -> KnownDistance | None:
         raise CommandError("length", f"--length {text!r}: ID,ID=METRES is valid, 3,7=0.12") from error
 
 
-def _views(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
+def _views(options: CalibrateOptions, board: tuple[int, int] | None) -> RigViews:
     if options.images is None:
         return _live(options)
     if options.images.suffix == IMAGES_SUFFIX:
@@ -154,7 +142,7 @@ def _views(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
     return _folders(options, board)
 
 
-def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
+def _folders(options: CalibrateOptions, board: tuple[int, int] | None) -> RigViews:
     """Views of pictures in one folder per camera; pictures of one pose have the same name, apart from the camera's."""
     assert options.images is not None
     folders = sorted(path for path in options.images.glob("*") if path.is_dir())
@@ -190,7 +178,7 @@ def _folders(options: RigOptions, board: tuple[int, int] | None) -> RigViews:
             found[key] = detector.detect(Frame(name, len(found), 0, 0, image), None)
         assert size is not None
         shown = sum(o.ids.size > 0 for o in found.values())
-        note(f"camera {name}: the body in {shown} of {len(files)} pictures")
+        log(f"camera {name}: the body in {shown} of {len(files)} pictures")
         if board is not None and not shown:
             raise CommandError(
                 "images",
@@ -217,7 +205,7 @@ def _stacked(cameras: list[TrialCamera], keys: list[str], seen: dict[str, dict[s
     return RigViews(tuple(cameras), ids, tuple(keys), pixels, sigmas)
 
 
-def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -> Detector:
+def _detector(options: CalibrateOptions, camera: str, board: tuple[int, int] | None) -> Detector:
     """The board's detector, or that of the cell file's camera of this name."""
     context = DriverContext(MonotonicClock(), "rig", Path(), Path(), camera=camera)
     if board is not None:
@@ -242,7 +230,7 @@ def _detector(options: RigOptions, camera: str, board: tuple[int, int] | None) -
     return found
 
 
-def _recorded(options: RigOptions) -> RigViews:
+def _recorded(options: CalibrateOptions) -> RigViews:
     """Views of a recording of ``record --images``, taken while the body was held still."""
     assert options.images is not None
     if not options.cell:
@@ -254,12 +242,12 @@ def _recorded(options: RigOptions) -> RigViews:
     for section in cell.camera:
         one = recorded_camera(cell, path, section.name, video_of(options.images, section.name))
         cameras.append(TrialCamera(section.name, one.description.width, one.description.height))
-        seen[section.name] = list(one.observations(note))
-        note(f"camera {section.name}: {len(seen[section.name])} frames")
+        seen[section.name] = list(one.observations(log))
+        log(f"camera {section.name}: {len(seen[section.name])} frames")
     return still_places(cameras, seen)
 
 
-def _live(options: RigOptions) -> RigViews:
+def _live(options: CalibrateOptions) -> RigViews:
     """Views of a cell file's cameras, observed for some seconds while the body is held in various poses."""
     if not options.cell:
         raise CommandError(
@@ -271,11 +259,10 @@ def _live(options: RigOptions) -> RigViews:
     pid = holder(directories.daemon_lock)
     if pid is not None:
         raise CommandError(
-            "daemon_runs",
-            f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording",
+            "daemon_runs", f"the daemon (process {pid}) has the cameras: end it with `kill {pid}`, or use a recording"
         )
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("rig"))
-    note(
+    log(
         f"watching for {options.seconds:g} s: hold the body still for half a second, here and there, also tilted, near "
         "and far, in the pictures' corners"
     )
@@ -293,7 +280,7 @@ def _live(options: RigOptions) -> RigViews:
         raise CommandError("cameras", "; ".join(failed))
     cameras = [TrialCamera(r.description.name, r.description.width, r.description.height) for r in records]
     views = still_places(cameras, {r.description.name: r.seen for r in records})
-    note(f"{len(views.names)} places in {time.monotonic() - began:.0f} s")
+    log(f"{len(views.names)} places in {time.monotonic() - began:.0f} s")
     return views
 
 
@@ -349,9 +336,7 @@ def _text(result: RigCalibration, advice: list[ViewAdvice], path: Path) -> str:
                 f"{value:.6f} ± {d[name]:.6f}"
                 for name, value in zip(("tx", "ty", "tz"), camera.translation, strict=True)
             )
-            lines += [
-                f"    from {first}: turned by {angle:.4f}° ± {turn:.4f}°, translation {place}{unit}",
-            ]
+            lines += [f"    from {first}: turned by {angle:.4f}° ± {turn:.4f}°, translation {place}{unit}"]
     if result.unit != "m":
         lines.append("  lengths are in baselines: state one (--length ID,ID=METRES) for metres")
     worst = ", ".join(

@@ -17,16 +17,11 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.cli.output import CommandError, note
+from stereoservo.cli.output import CommandError, log
 from stereoservo.core.cycle import Event
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
-from stereoservo.core.sources.measure_at_pose import (
-    add_observation,
-    averages,
-    measurement_buffers,
-    too_few_seen,
-)
+from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers, too_few_seen
 from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
 from stereoservo.daemon.jobs.fit_job import report_folder
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
@@ -106,7 +101,7 @@ def fit_stored_trials(cell: str, path: Path, lines: Path | None, lines_sigma: fl
     try:
         page: Path | None = report_fit(data, path, output, result, assessment, known)
     except OSError as error:
-        note(f"no report could be written into {report_folder(output)}: {error}")
+        log(f"no report could be written into {report_folder(output)}: {error}")
         page = None
     figures = calibration_result(result.model, output, assessment, page, path, seconds)
     use = (
@@ -219,9 +214,7 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
         except GeometryError as error:
             names = ", ".join(repr(line) for line in of_camera)
             raise CommandError(
-                "lines",
-                f"{path}: lines of camera {camera!r} ({names}, counted from 0): {error}",
-                camera=camera,
+                "lines", f"{path}: lines of camera {camera!r} ({names}, counted from 0): {error}", camera=camera
             ) from error
     names_of = {camera: tuple(of_camera) for camera, of_camera in found.items()}
     return lenses, LinesUsed(str(path), sigma, names_of)
@@ -263,24 +256,23 @@ def fit_images(cell: str, images: Path, output: Path | None) -> ImageFit:
 
     if not cell.endswith(".toml"):
         raise CommandError(
-            "usage",
-            f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml",
+            "usage", f"--images needs the cell file, for its cameras' detectors; {cell!r} is a name. Give CELL.toml"
         )
     resolve_cell(cell, output)
 
     def progress(camera: str, frames: int) -> None:
         if frames % TELL_EVERY == 0:
-            note(f"camera {camera}: {frames} frames")
+            log(f"camera {camera}: {frames} frames")
 
-    found = trials_from_images(Path(cell), images, note, progress)
+    found = trials_from_images(Path(cell), images, log, progress)
     for why, number in found.left_out.items():
-        note(f"{number} rests are not used: {why}")
+        log(f"{number} rests are not used: {why}")
     if found.standing:
         markers = ", ".join(str(marker) for marker in found.standing)
-        note(f"markers {markers} stood still: they are not of the body, and left out")
+        log(f"markers {markers} stood still: they are not of the body, and left out")
     path = images / TRIALS_FILE
     save_trials(found.trials, path)
-    note(f"{found.stops} stops, {found.frames} frames; the trial data are kept in {path}")
+    log(f"{found.stops} stops, {found.frames} frames; the trial data are kept in {path}")
     used = ImagesUsed(str(images), found.stops, found.frames, found.left_out, found.standing)
     fit = fit_stored_trials(cell, path, None, 0.3, output)
     return ImageFit(**{**msgspec.structs.asdict(fit), "from_images": used})
@@ -345,7 +337,7 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
         )
     gathered = RecordedTrialCollector(motion, settings, settings.trials)
     for camera in cameras:
-        gathered.add(_observations(camera, gathered, note, progress))
+        gathered.add(_observations(camera, gathered, log, progress))
     job = TrialCollector(settings)
     events = gathered.events()
     for event in events:
@@ -365,7 +357,7 @@ def _observations(
         progress(name, frames)
         return gathered.wants(name, t_shutter_ns)
 
-    return camera.observations(note, is_usable)
+    return camera.observations(log, is_usable)
 
 
 def _settings(cell: CellFile, cell_path: Path, motion: RecordedMotion, cameras: list[RecordedCamera]) -> CoreSettings:

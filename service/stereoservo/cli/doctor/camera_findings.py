@@ -14,13 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.numerics.arrays import FloatArray, ImageArray
-from stereoservo.ports.devices import (
-    CameraDescription,
-    CameraObservation,
-    CameraStatistics,
-    ExaminationFinding,
-    Frame,
-)
+from stereoservo.ports.devices import CameraDescription, CameraObservation, CameraStatistics, ExaminationFinding, Frame
 
 HELD_RATE = 0.95
 """Share of the stated rate below which a camera is reported as too slow."""

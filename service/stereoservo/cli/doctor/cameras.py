@@ -322,10 +322,7 @@ def _by_model(records: Sequence[CameraRecord], cameras: Sequence[CameraModel]) -
                 if r.name != cameras[k].name
             )
             return ExaminationFinding(
-                name,
-                False,
-                f"{summary}: {swapped}",
-                "exchange their sources, or their cables; none has moved",
+                name, False, f"{summary}: {swapped}", "exchange their sources, or their cables; none has moved"
             )
     return ExaminationFinding(
         name,
@@ -340,9 +337,7 @@ def _by_epipolar(first: CameraRecord, second: CameraRecord) -> ExaminationFindin
     name = f"views {first.name}-{second.name}"
     if len(ids) < MATCHES:
         return ExaminationFinding(
-            name,
-            None,
-            f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything",
+            name, None, f"{len(ids)} markers are seen by both; the epipolar constraint needs {MATCHES} to say anything"
         )
     sigma = float(np.median(np.concatenate([mean_observations(first)[2], mean_observations(second)[2]])))
     try:

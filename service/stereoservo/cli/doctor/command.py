@@ -36,13 +36,11 @@ def doctor(
         str, typer.Argument(metavar="NAME|PATH", help="A cell file (.toml), or the name of a shipped one.")
     ],
     jog: Annotated[
-        bool,
-        typer.Option("--jog", help="Also turn each joint by one degree and back, once allowed: checks its units."),
+        bool, typer.Option("--jog", help="Also turn each joint by one degree and back, once allowed: checks its units.")
     ] = False,
     yes: Annotated[bool, typer.Option("--yes", help="Allow what --jog asks for.")] = False,
     seconds: Annotated[
-        float,
-        typer.Option("--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0),
+        float, typer.Option("--seconds", help="How long the cameras are watched; 0: not at all.", min=0.0, max=600.0)
     ] = 2.0,
     pictures: Annotated[
         Path | None,
@@ -64,9 +62,7 @@ def doctor(
     if failed:
         tree = msgspec.to_builtins(findings)
         raise CommandError(
-            "checks_failed",
-            "; ".join(f"{finding.name}: {finding.message}" for finding in failed),
-            checks=tree,
+            "checks_failed", "; ".join(f"{finding.name}: {finding.message}" for finding in failed), checks=tree
         )
     emit({"checks": findings}, "", json)
 
@@ -160,9 +156,7 @@ def _wire(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     except SessionError as error:
         return ExaminationFinding("zenoh", False, str(error))
     return ExaminationFinding(
-        "zenoh",
-        True,
-        f"{config['mode']}: {', '.join(config['listen']['endpoints'] or config['connect']['endpoints'])}",
+        "zenoh", True, f"{config['mode']}: {', '.join(config['listen']['endpoints'] or config['connect']['endpoints'])}"
     )
 
 
@@ -171,9 +165,7 @@ def _model(plan: RunPlan, directories: CellDirectories) -> ExaminationFinding:
     if model is not None and passed:
         why = "; ".join(passed)
         return ExaminationFinding(
-            "model",
-            None,
-            f"epoch {model.epoch} of {model.created} is used, newer ones are passed over: {why}",
+            "model", None, f"epoch {model.epoch} of {model.created} is used, newer ones are passed over: {why}"
         )
     if model is not None:
         return ExaminationFinding("model", True, f"epoch {model.epoch}, {model.stratum}, of {model.created}")
@@ -193,9 +185,7 @@ def _scheduling(plan: RunPlan, directories: CellDirectories) -> ExaminationFindi
     soft, _ = resource.getrlimit(resource.RLIMIT_RTPRIO)
     if requested == 0 or soft >= requested or soft == resource.RLIM_INFINITY or _is_root():
         return ExaminationFinding(
-            "scheduling",
-            True,
-            f"SCHED_FIFO priority {requested}" if requested else "ordinary scheduling was asked for",
+            "scheduling", True, f"SCHED_FIFO priority {requested}" if requested else "ordinary scheduling was asked for"
         )
     return ExaminationFinding(
         "scheduling",

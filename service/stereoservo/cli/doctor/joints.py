@@ -42,8 +42,7 @@ def permission(jog: bool, yes: bool) -> MayMove:
         return lambda _: True
     if not sys.stdin.isatty():
         raise CommandError(
-            "argument",
-            "--jog asks on the terminal before anything moves, and there is none; --yes answers for it",
+            "argument", "--jog asks on the terminal before anything moves, and there is none; --yes answers for it"
         )
     return lambda question: typer.confirm(question, default=False, err=True)
 

@@ -187,9 +187,7 @@ def judge_turn(joint: str, travel: float, turn: Turn | None) -> ExaminationFindi
     told = f"{math.degrees(abs(travel)):.3f}°"
     if turn is None:
         return ExaminationFinding(
-            name,
-            None,
-            "no face of dots was seen before and after: whether the encoder's travel is true is not known",
+            name, None, "no face of dots was seen before and after: whether the encoder's travel is true is not known"
         )
     seen = f"{math.degrees(turn.angle):.3f}° (± {math.degrees(turn.sigma):.3f}°)"
     shift = f"the dots went {_direction(turn.shift)} in {turn.camera!r}"

@@ -76,12 +76,7 @@ class Dialogue:
         self._doing = what
 
     def ask(
-        self,
-        key: str,
-        question: str,
-        default: str | None,
-        parse: Callable[[str], T],
-        shown: Callable[[str], str] = str,
+        self, key: str, question: str, default: str | None, parse: Callable[[str], T], shown: Callable[[str], str] = str
     ) -> T:
         """The answer to a question, parsed by ``parse``, which raises ValueError with the valid values.
 
@@ -119,8 +114,7 @@ class Dialogue:
             return text
         if not sys.stdin.isatty():
             raise CommandError(
-                "terminal",
-                "setup asks on the terminal, and there is none; --answers FILE answers for a person",
+                "terminal", "setup asks on the terminal, and there is none; --answers FILE answers for a person"
             )
         with self._lock:
             self._write(f"?  {prompt}", end="")

@@ -17,16 +17,7 @@ import numpy as np
 from stereoservo.core.cycle import ModelUpdate, StepInputs, StepOutputs
 from stereoservo.daemon.lockstep import LockstepCell, LockstepTimeoutError
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import (
-    Enable,
-    FeatureTarget,
-    Goal,
-    JointTarget,
-    LawName,
-    Reset,
-    Resume,
-    RunGoal,
-)
+from stereoservo.messages.goals import Enable, FeatureTarget, Goal, JointTarget, LawName, Reset, Resume, RunGoal
 from stereoservo.messages.status import Lifecycle
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointState
@@ -340,10 +331,7 @@ FAULTS = (
 
 
 def run_inputs(
-    repetitions: int,
-    seed: int,
-    tell: Callable[[dict[str, Any]], None],
-    faults: tuple[InputFault, ...] = FAULTS,
+    repetitions: int, seed: int, tell: Callable[[dict[str, Any]], None], faults: tuple[InputFault, ...] = FAULTS
 ) -> list[dict[str, Any]]:
     """Rows of all faults, ``repetitions`` trials each, reproducible for one seed; ``tell`` is called with each.
 

@@ -23,7 +23,7 @@ WARM_S = 0.6
 """Time of motion before the fault, in which the monitors learn normal values."""
 
 
-def say(event: str, **data: object) -> None:
+def report(event: str, **data: object) -> None:
     """Write one line to the parent."""
     print(json.dumps({"event": event, **data}), flush=True)
 
@@ -45,16 +45,16 @@ def move(driver: CanJointDriver, speed: float) -> None:
         fault = driver.master.fault
         if fault is not None and not told["fault"]:
             told["fault"] = True
-            say("fault", code=fault.code, message=fault.text(), t_ns=fault.t_ns)
+            report("fault", code=fault.code, message=fault.text(), t_ns=fault.t_ns)
         if not told["moving"] and fault is None and time.monotonic() - begun > WARM_S:
             told["moving"] = True
-            say("moving", t_ns=time.monotonic_ns())
+            report("moving", t_ns=time.monotonic_ns())
         due = max(due + period, time.monotonic() - period)
         if select.select([sys.stdin], [], [], max(due - time.monotonic(), 0.0))[0]:
             if not sys.stdin.readline():
                 return
             hangs = True
-            say("hangs", t_ns=time.monotonic_ns())
+            report("hangs", t_ns=time.monotonic_ns())
 
 
 def main(options: str, speed: float) -> None:
@@ -69,7 +69,7 @@ def main(options: str, speed: float) -> None:
             driver.activate()
             move(driver, speed)
         except DriverError as error:
-            say("failed", code=error.code, message=str(error))
+            report("failed", code=error.code, message=str(error))
         finally:
             driver.close()
 

@@ -25,17 +25,9 @@ import numpy as np
 
 from stereoservo.client import Client, ClientError, RefusedError, SessionError
 from stereoservo.messages.wire import EventMessage, decode
-from stereoservo_drivers.kit.watchdog import StallWatch
+from stereoservo_drivers.kit.timing import StallWatch
 from stereoservo_sim.benchmarks import service_bench
-from stereoservo_sim.benchmarks.service_bench import (
-    CELL,
-    END,
-    SPEED_SCALE,
-    ServiceBench,
-    VoidTrialError,
-    during,
-    send,
-)
+from stereoservo_sim.benchmarks.service_bench import CELL, END, SPEED_SCALE, ServiceBench, VoidTrialError, during, send
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.world.history import TrueJointHistory
 
@@ -148,7 +140,7 @@ def records_again(bench: ServiceBench) -> str:
             time.sleep(0.05)
         return True
 
-    if not bench.asked(ring_grows):
+    if not bench.query(ring_grows):
         return f"the flight ring is not written {GROWS_S:g} s after there was room"
     try:
         _record(bench)
@@ -387,7 +379,7 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
                 bench.end_daemon()
                 anew = True
             if fault.note or (fault.disk is not None and anew):
-                bench.forget_state()
+                bench.delete_state()
             took_s.append(time.monotonic() - began_s)
         if trial["stall_s"] > STALL_S:
             void.append(f"the machine stalled for {trial['stall_s'] * 1e3:.0f} ms")
@@ -395,7 +387,7 @@ def _row(bench: ServiceBench, fault: ServiceFault, repetitions: int) -> dict[str
             trials.append(trial)
     if fault.trials_a_daemon or fault.disk is not None:
         bench.end_daemon()
-        bench.forget_state()
+        bench.delete_state()
     rests = [trial["rest_ms"] for trial in trials if trial["rest_ms"] is not None]
     bound = None if fault.bound_ms is None else fault.bound_ms + RAMP_MS
     return {
@@ -434,8 +426,7 @@ def _trial(bench: ServiceBench, fault: ServiceFault) -> dict[str, Any]:
     client = Client(CELL)
     told_live: list[EventMessage] = []
     client.session.declare_subscriber(
-        client.keys.event,
-        lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage)),
+        client.keys.event, lambda sample: told_live.append(decode(sample.payload.to_bytes(), EventMessage))
     )
     try:
         if fault.client:
@@ -541,7 +532,7 @@ def _afterwards(
         time.sleep(0.3)
         return client.events(0).events, client.status().notes
 
-    events, notes = bench.asked(told)
+    events, notes = bench.query(told)
     ended = [event for event in (*told_live, *events) if event.kind in TERMINAL]
     ends = [{(event.boot, event.seq) for event in ended if event.id == goal} for goal in bench.goals]
     return tuple(map(len, ends)), tuple(note.replace(f"{bench.folder}/", "") for note in notes)

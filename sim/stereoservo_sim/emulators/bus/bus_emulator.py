@@ -222,20 +222,13 @@ class BusEmulator:
     or plugged in again (True).
     """
 
-    def __init__(
-        self,
-        nodes: Sequence[EmulatedNode],
-        plant: AxisPlant,
-        *,
-        bitrate: int | None,
-        t_ns: int,
-    ) -> None:
+    def __init__(self, nodes: Sequence[EmulatedNode], plant: AxisPlant, *, bitrate: int | None, t_ns: int) -> None:
         self.t_ns = t_ns
         self.start_ns = t_ns
         self.plant = plant
         self.wire = Wire(bitrate)
         self.events: deque[BusEvent] = deque(maxlen=EVENTS_KEPT)
-        self._news: list[BusEvent] = []
+        self._new_events: list[BusEvent] = []
         self.disturbances = Disturbances()
         self.on_adapter: Callable[[bool], None] = lambda plugged: None
         self._delivered: list[tuple[int, CanFrame]] = []
@@ -248,8 +241,8 @@ class BusEmulator:
             node.power_up(t_ns)
             self.slots.append(Slot(node, index, index))
         for slot in self.slots:
-            self.look(slot)
-        self._launch()
+            self.collect_output(slot)
+        self._start_transmission()
 
     @property
     def nodes(self) -> tuple[EmulatedNode, ...]:
@@ -262,7 +255,7 @@ class BusEmulator:
         if not self.disturbances.master_passes(frame):
             return
         self.wire.send(MASTER, frame)
-        self._launch()
+        self._start_transmission()
 
     def run_until(self, t_ns: int) -> None:
         """Process all events up to ``t_ns``, included. Raises BusEmulatorError."""
@@ -273,7 +266,7 @@ class BusEmulator:
                 raise BusEmulatorError(f"no end of events at {due} ns: {self._stuck(due)}")
             instant = due
             self.t_ns = max(self.t_ns, due)
-            self._happen(self.t_ns)
+            self._process_next(self.t_ns)
         self.t_ns = max(self.t_ns, t_ns)
 
     def due_ns(self) -> int:
@@ -293,9 +286,9 @@ class BusEmulator:
         frames, self._delivered = self._delivered, []
         return frames
 
-    def take_news(self) -> list[BusEvent]:
+    def take_events(self) -> list[BusEvent]:
         """Events since the last call."""
-        news, self._news = self._news, []
+        news, self._new_events = self._new_events, []
         return news
 
     def order(self, text: str, t_ns: int) -> str:
@@ -309,7 +302,7 @@ class BusEmulator:
             return postponed
         self.run_until(t_ns)
         answer = self.faults.do(command, self.t_ns)
-        self._launch()
+        self._start_transmission()
         return answer
 
     def _check_node(self, command: BusCommand) -> None:
@@ -333,7 +326,7 @@ class BusEmulator:
             node.power_up(self.t_ns)
         slot = Slot(node, self._next_index(), None)
         self.slots.append(slot)
-        self.look(slot)
+        self.collect_output(slot)
 
     def _next_index(self) -> int:
         return max(slot.index for slot in self.slots) + 1
@@ -348,7 +341,7 @@ class BusEmulator:
         self.disturbances.master_connected = False
         for slot in self.slots:
             slot.node.power_up(t_ns)  # a reboot: the axis loses its power
-            self.look(slot)
+            self.collect_output(slot)
 
     def status(self) -> list[str]:
         """Status, one line a node."""
@@ -363,7 +356,7 @@ class BusEmulator:
         """Release the plant."""
         self.plant.close()
 
-    def _happen(self, t_ns: int) -> None:
+    def _process_next(self, t_ns: int) -> None:
         if self.wire.end_ns <= t_ns:
             self._end_of_frame(t_ns)
         elif self._held and self._held[0][0] <= t_ns:
@@ -371,14 +364,14 @@ class BusEmulator:
             self.wire.send(sender, frame)
         elif not self.faults.advance(t_ns):
             self._tick(t_ns)
-        self._launch()
+        self._start_transmission()
 
     def _tick(self, t_ns: int) -> None:
         for slot in self.slots:
             if slot.due_ns <= t_ns:
                 self.plant.observe(t_ns)
                 slot.node.advance(t_ns)
-                self.look(slot)
+                self.collect_output(slot)
         for node_id, (when, period) in self.babble.items():
             if when <= t_ns:
                 self.babble[node_id] = when + period, period
@@ -400,7 +393,7 @@ class BusEmulator:
                 return
         elif sender != MASTER:
             self._delivered.append((t_ns, frame))
-        hearers = [slot for slot in self.slots if slot.sender != sender and slot.node.hears(frame)]
+        hearers = [slot for slot in self.slots if slot.sender != sender and slot.node.accepts(frame)]
         if hearers:
             self.plant.observe(t_ns)
         for slot in hearers:
@@ -408,13 +401,13 @@ class BusEmulator:
             if node.node_id in cut or sender == BABBLE + node.node_id:
                 continue
             node.receive(frame, t_ns)
-            self.look(slot)
+            self.collect_output(slot)
 
     def remove(self, slots: list[Slot]) -> None:
         """Remove nodes that ``add`` added."""
         self.slots = [slot for slot in self.slots if slot not in slots]
 
-    def look(self, slot: Slot, keep: int = -1) -> list[CanFrame]:
+    def collect_output(self, slot: Slot, keep: int = -1) -> list[CanFrame]:
         """Collect a node's frames to send, its next due time, and its state changes.
 
         Frames of id ``keep`` are returned instead of sent.
@@ -440,16 +433,16 @@ class BusEmulator:
         if state is not slot.state and state != slot.state:
             slot.state = state
             self.tell("state", slot.node.node_id, state)
-            self._stick(slot)
+            self._trip_again(slot)
         return kept
 
-    def _stick(self, slot: Slot) -> None:
+    def _trip_again(self, slot: Slot) -> None:
         """Trip the drive again, for a persistent cause, as soon as its fault has been reset."""
         code = self.disturbances.sticky.get(slot.node.node_id)
         if code is None or slot.plant_index is None or "fault" in slot.state or "error" in slot.state:
             return
         slot.node.trip(code, self.t_ns)
-        self.look(slot)
+        self.collect_output(slot)
 
     def _watch_motion(self, slot: Slot) -> None:
         if slot.plant_index is None:
@@ -459,14 +452,14 @@ class BusEmulator:
             slot.moving = moving
             self.tell("moves" if moving else "rest", slot.node.node_id)
 
-    def _launch(self) -> None:
+    def _start_transmission(self) -> None:
         self.wire.start(self.t_ns)
 
     def tell(self, kind: str, node: int, text: str = "") -> None:
         event = BusEvent(self.t_ns, kind, node, text)
         self.events.append(event)
-        if len(self._news) < EVENTS_KEPT:
-            self._news.append(event)
+        if len(self._new_events) < EVENTS_KEPT:
+            self._new_events.append(event)
 
     def _stuck(self, due: int) -> str:
         late = [f"node {slot.node.node_id} is due at {slot.due_ns} ns" for slot in self.slots if slot.due_ns <= due]
@@ -593,7 +586,7 @@ NMT_WORD = choice_word({name: {"what": name, "number": number} for name, number 
 def _fault(emulator: BusEmulator, command: BusCommand) -> str:
     slot = emulator.slot(command.node)
     slot.node.trip(command.number, emulator.t_ns)
-    emulator.look(slot)
+    emulator.collect_output(slot)
     return f"node {command.node}: fault {command.number:#06x}; now {slot.node.state()}"
 
 
@@ -630,7 +623,7 @@ def _speak(emulator: BusEmulator, command: BusCommand) -> str:
 def _reboot(emulator: BusEmulator, command: BusCommand) -> str:
     slot = emulator.slot(command.node)
     slot.node.power_up(emulator.t_ns)
-    emulator.look(slot)
+    emulator.collect_output(slot)
     return f"node {command.node}: reboots"
 
 
@@ -671,7 +664,7 @@ def _remap(emulator: BusEmulator, command: BusCommand) -> str:
         head = 0x23 | (4 - size) << 2  # expedited download with its size
         data = struct.pack("<BHBI", head, index, subindex, value)
         slot.node.receive(CanFrame(0x600 + command.node, data), emulator.t_ns)
-        answers = emulator.look(slot, keep=COB_IDS["sdo"] + command.node)
+        answers = emulator.collect_output(slot, keep=COB_IDS["sdo"] + command.node)
         if not answers:
             raise FaultCommandError(f"node {command.node} answers no SDO: its protocol has no mapping")
         if answers[0].data[0] != 0x60:
@@ -729,7 +722,7 @@ def _update_inputs(emulator: BusEmulator, command: BusCommand) -> None:
     slot = emulator.slot(command.node)
     emulator.plant.observe(emulator.t_ns)
     slot.node.advance(emulator.t_ns)
-    emulator.look(slot)
+    emulator.collect_output(slot)
 
 
 def _block(emulator: BusEmulator, command: BusCommand) -> Answer:
@@ -764,14 +757,6 @@ def _flood(emulator: BusEmulator, command: BusCommand) -> Answer:
 def _calm(emulator: BusEmulator, command: BusCommand) -> str:
     emulator.babble.pop(command.node, None)
     return f"node {command.node}: calm"
-
-
-def _status(emulator: BusEmulator, command: BusCommand) -> str:
-    return "\n".join(emulator.status())
-
-
-def _help(emulator: BusEmulator, command: BusCommand) -> str:
-    return "\n".join(LANGUAGE.help_lines())
 
 
 def frame_id(node_id: int, what: str) -> int:
@@ -834,9 +819,8 @@ LANGUAGE = FaultLanguage(
         ),
         "block": Verb("block N", "the joint of node N is in contact: it cannot move", _block, (NODE,), lasting=True),
         "free": Verb("free N", "ends `block`", _free, (NODE,)),
-        "status": Verb("status", "the state of all drives", _status, logged=False),
-        "help": Verb("help", "this list", _help, logged=False),
     },
+    devices="drives",
     example="silence 4",
 )  # fmt: skip
 """The console language of ``emulate drives``."""

@@ -18,8 +18,7 @@ from typing import Any, Protocol, Self
 import msgspec
 
 from stereoservo.messages.addresses import Address
-from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.can.messages import from_message, to_message
+from stereoservo_drivers.can.frames import CanFrame, from_message, to_message
 from stereoservo_drivers.can.slcan_adapter import SlcanAdapter
 from stereoservo_drivers.canopen.options import CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator, BusEvent
@@ -77,11 +76,7 @@ class BusServer:
     """
 
     def __init__(
-        self,
-        emulator: BusEmulator,
-        endpoint: Endpoint,
-        *,
-        clock_ns: Callable[[], int] = time.monotonic_ns,
+        self, emulator: BusEmulator, endpoint: Endpoint, *, clock_ns: Callable[[], int] = time.monotonic_ns
     ) -> None:
         self.emulator = emulator
         self.endpoint = endpoint
@@ -241,7 +236,7 @@ class BusServer:
             request.done.set()
 
     def _pass_events(self) -> None:
-        news = self.emulator.take_news()
+        news = self.emulator.take_events()
         if self.on_event is not None:
             for event in news:
                 self.on_event(event)

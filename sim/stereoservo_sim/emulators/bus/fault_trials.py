@@ -8,8 +8,11 @@ or was powered again by itself afterwards.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import zlib
+from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
@@ -23,7 +26,147 @@ from stereoservo_drivers.canopen.master import Master, MasterFault, MasterSettin
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 from stereoservo_sim.emulators.bus.bus_emulator import BusEmulator
 from stereoservo_sim.emulators.bus.factory import DrivesSettings, make_bus_emulator
-from stereoservo_sim.emulators.bus.fault_cases import FaultCase
+
+Host = Literal["runs", "killed", "cycle_hangs", "loop_hangs", "adapter_gone"]
+Stage = Literal["running", "standing", "start", "reset"]
+
+
+class FaultCase(msgspec.Struct, frozen=True):
+    """One fault case of the table.
+
+    ``stage``: when the fault occurs: running; when the arm is enabled and about to move (standing; times count from its
+    first command); before bring-up (start); or a fault whose reset is then tried (reset). ``orders``: commands for the
+    emulated bus at that moment. ``host``: what happens to the master's computer then. ``codes``: what the master may
+    latch first, or bring-up may refuse with, one or several by the fault's phase; empty: nothing latches, motion
+    continues. ``bound_ms``: from the fault to all axes at rest. ``by``: the side that ends motion. ``afterwards``:
+    ordered once the axes rest: it removes the cause, and nothing may move again by itself. ``options``: changes of the
+    cell's options. ``warm_s``: motion before the fault. ``towards``: the node that has to move in its positive
+    direction; 0: none.
+    """
+
+    name: str
+    orders: tuple[str, ...] = ()
+    codes: tuple[str, ...] = ()
+    afterwards: tuple[str, ...] = ()
+    bound_ms: float | None = None
+    host: Host = "runs"
+    by: Literal["master", "drives", "bring-up", "nobody"] = "master"
+    stage: Stage = "running"
+    options: dict[str, Any] = {}
+    warm_s: float = 0.1
+    towards: int = 0
+
+
+AFTER_A_HANG = "emergency, left_operational, drive_fault, disabled, bus_silent"
+"""Codes that a thread may find first when it continues after the drives have stopped by themselves."""
+SWITCHES_SENT = {"feedback": ("velocity", "switches")}
+NO_DEADLINE = {"rpdo_deadline_ms": 0}
+"""The drives' deadline for commands is off: their heartbeat monitor (0x1016) of the master acts alone."""
+
+
+def _case(
+    name: str, orders: str = "", codes: str = "", bound_ms: float | None = None, afterwards: str = "", **more: Any
+) -> FaultCase:
+    """A fault case whose orders and codes are given as one text, separated by ``, ``."""
+    first, latched, last = (tuple(filter(None, text.split(", "))) for text in (orders, codes, afterwards))
+    return FaultCase(name, first, latched, last, bound_ms, **more)
+
+
+EITHER_PROTOCOL = (
+    _case("node silent", "silence 4", "silent", 60, "speak 4"),
+    _case("duplicate node id running", "duplicate 2 running", "duplicate", 60, "duplicate 2 off"),
+    _case(
+        "limit switch active before motion",
+        "limit 3 +",
+        "limit_switch, emergency, drive_fault",
+        40,
+        "limit 3 off",
+        options=SWITCHES_SENT,
+        towards=3,
+        stage="standing",
+    ),
+    _case(
+        "encoder against the command from the start",
+        "invert 3",
+        "encoder_reversed",
+        200,
+        "invert 3 off",
+        stage="standing",
+    ),
+    _case("duplicate node id at start", "duplicate 2 running", "duplicate_node", by="bring-up", stage="start"),
+    _case("node missing at start", "silence 4", "node_missing", by="bring-up", stage="start"),
+    _case("servo loop hangs", "", "loop_hung", 150, host="loop_hangs"),
+)
+"""Cases that are the same for drives of both protocols."""
+
+CIA402_CASES = (
+    *EITHER_PROTOCOL,
+    _case("drive fault with emergency", "fault 3 0x3210", "emergency, drive_fault", 40),
+    _case("emergency alone", "emcy 5 0x4210", "emergency", 40),
+    _case("node's cable out", "cable 4 out", "silent", 60, "cable 4 in"),
+    _case("node reboots", "reboot 5", "rebooted, silent", 60),
+    _case("one TPDO lost", "lose 2 tpdo1", by="nobody"),
+    _case("three TPDOs lost", "lose 2 tpdo1 3", by="nobody"),
+    _case("TPDOs late by 6 ms", "late 2 6ms", "late, silent", 150, "late 2 0", warm_s=0.5),
+    _case(
+        "duplicate node id boots", "duplicate 2 boots", "rebooted, duplicate, left_operational", 60, "duplicate 2 off"
+    ),
+    _case("mapping changed", "remap 3", "mapping, silent", 40),
+    _case("bus cable out", "cable out", "bus_silent", 150, "cable in", by="drives", options=NO_DEADLINE),
+    _case("bus cable out, RPDO deadline", "cable out", "bus_silent", 60, "cable in", by="drives"),
+    _case("master killed", "", "", 150, host="killed", by="drives", options=NO_DEADLINE),
+    _case("master killed, RPDO deadline", "", "", 60, host="killed", by="drives"),
+    _case("cycle thread hangs", "", AFTER_A_HANG, 150, host="cycle_hangs", by="drives", options=NO_DEADLINE),
+    _case("cycle thread hangs, RPDO deadline", "", AFTER_A_HANG, 60, host="cycle_hangs", by="drives"),
+    _case(
+        "adapter gone",
+        "adapter out",
+        "connection_lost",
+        150,
+        "adapter in",
+        host="adapter_gone",
+        by="drives",
+        options=NO_DEADLINE,
+    ),
+    _case("SYNC lost", "drop-sync", "bus_silent", 60, "pass-sync"),
+    _case("limit switch", "limit 3 +", "limit_switch, emergency", 40, "limit 3 off", options=SWITCHES_SENT, towards=3),
+    _case("limit switch, switches not sent", "limit 3 +", "limit_switch, emergency", 140, "limit 3 off", towards=3),
+    _case(
+        "NMT stop by a stranger",
+        "nmt stop",
+        "left_operational, emergency, disabled, drive_fault, bus_silent",
+        60,
+        "nmt start",
+    ),
+    _case("NMT reset of one node", "nmt reset 6", "rebooted, silent, left_operational", 60),
+    _case("babbling node", "flood 1", "bus_flood", 60, "calm 1"),
+    _case("encoder runs against the command", "invert 3", "encoder_reversed", 200, "invert 3 off"),
+    _case("drive in fault at start", "fault 3 0x3210", "drive_fault, emergency", stage="start"),
+    _case("cause that stays: reset refused", "sticky 3 0x4310", "emergency, drive_fault", 40, stage="reset"),
+)
+"""Cases of six CiA 402 drives at 250 Hz with ramps of 12.5 ms."""
+
+ODRIVE_CASES = (
+    *EITHER_PROTOCOL,
+    _case("drive error", "fault 3 0x20", "drive_fault", 40),
+    _case("node reboots", "reboot 5", "silent", 60),
+    _case("one answer lost", "lose 2 0x049", by="nobody"),
+    _case("answers late by 6 ms", "late 2 6ms", "late, silent", 150, "late 2 0", warm_s=0.5),
+    _case("bus cable out", "cable out", "bus_silent", 150, "cable in", by="drives"),
+    _case("master killed", "", "", 150, host="killed", by="drives"),
+    _case("cycle thread hangs", "", AFTER_A_HANG, 150, host="cycle_hangs", by="drives"),
+    _case("end stop", "limit 3 +", "drive_fault", 40, "limit 3 off", towards=3),
+    _case("drive in error at start", "fault 3 0x20", "drive_fault", stage="start"),
+    _case("cause that stays: reset refused", "sticky 3 0x2000", "drive_fault", 40, stage="reset"),
+)
+"""Cases of six ODrives whose watchdogs are set to 100 ms."""
+
+CASES: dict[str, tuple[FaultCase, ...]] = {"cia402": CIA402_CASES, "odrive": ODRIVE_CASES}
+"""Cases by protocol."""
+
+
+# -- fault trials ------------------------------------------------------------------------------------------
+
 
 AXES = 6
 RATE_HZ = 250.0
@@ -79,11 +222,7 @@ def trial_options(protocol: str, **changes: object) -> CanOptions:
         for k in range(1, AXES + 1)
     )
     base = CanOptions(
-        protocol="odrive" if odrive else "cia402",
-        interface="virtual",
-        channel="trial",
-        rate_hz=RATE_HZ,
-        joint=joints,
+        protocol="odrive" if odrive else "cia402", interface="virtual", channel="trial", rate_hz=RATE_HZ, joint=joints
     )
     return msgspec.structs.replace(base, **changes)
 
@@ -177,7 +316,7 @@ def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
     t0 = rig.host.t_ns
     rig.order(case.orders)
     rig.host.velocities = speed
-    _strike(rig)
+    _inject_host_fault(rig)
     if case.by == "nobody":
         return _tolerated(rig, speed)
     rest_ns = _until_rest(rig, t0)
@@ -195,7 +334,7 @@ def _run(rig: FaultRig, rng: np.random.Generator, run_on_s: float) -> Trial:
     )
 
 
-def _strike(rig: FaultRig) -> None:
+def _inject_host_fault(rig: FaultRig) -> None:
     """Inject the fault of the master's host."""
     if rig.case.host in ("killed", "cycle_hangs"):
         rig.host.cycling = False
@@ -412,3 +551,75 @@ class VirtualHost(Subscriptions):
         self.plugged = plugged
         if not plugged:
             self.master.latch(MasterFault("connection_lost", "the adapter was unplugged", t_ns=self.emulator.t_ns))
+
+
+# -- rows of the fault table -----------------------------------------------------------------------------------
+
+
+class FaultRow(msgspec.Struct, frozen=True):
+    """Summary of one fault over several trials.
+
+    Times [ms] after the fault. ``detected_cycles``: largest, in cycles of the master. ``codes``: count of each code
+    latched first. ``restarts``: trials in which something moved or was powered again by itself.
+    """
+
+    protocol: str
+    fault: str
+    trials: int
+    detected_ms_median: float | None
+    detected_ms_max: float | None
+    detected_cycles: int | None
+    rest_ms_median: float | None
+    rest_ms_max: float | None
+    bound_ms: float | None
+    by: str
+    codes: dict[str, int]
+    restarts: int
+    problems: tuple[str, ...]
+    ok: bool
+
+
+def trial_rng(case: FaultCase, protocol: str, seed: int, trial: int) -> np.random.Generator:
+    """Random generator of one trial's phase and directions, different for every fault."""
+    return np.random.default_rng([seed, trial, zlib.crc32(f"{protocol} {case.name}".encode())])
+
+
+def run_row(case: FaultCase, protocol: str, trials: int, seed: int, *, run_on_s: float = 1.0) -> FaultRow:
+    """Run ``trials`` trials. Raises TrialError."""
+    return summarize(
+        case,
+        protocol,
+        [run_trial(case, protocol, trial_rng(case, protocol, seed, k), run_on_s=run_on_s) for k in range(trials)],
+    )
+
+
+def summarize(case: FaultCase, protocol: str, trials: Sequence[Trial]) -> FaultRow:
+    """Row of a fault's trials. If only the drives detect a fault, a later latch of the master is no detection."""
+    seen = [] if case.host in ("killed", "cycle_hangs") else [trial.detected_ms for trial in trials]
+    detected_median, detected_max = _median_and_max(seen)
+    rest_median, rest_max = _median_and_max([trial.rest_ms for trial in trials])
+    problems = tuple(sorted({trial.problem for trial in trials if trial.problem}))
+    return FaultRow(
+        protocol=protocol,
+        fault=case.name,
+        trials=len(trials),
+        detected_ms_median=detected_median,
+        detected_ms_max=detected_max,
+        detected_cycles=None if detected_max is None else math.ceil(detected_max * 1e-3 * RATE_HZ),
+        rest_ms_median=rest_median,
+        rest_ms_max=rest_max,
+        bound_ms=case.bound_ms,
+        by=case.by,
+        codes=dict(Counter(trial.code for trial in trials if trial.code)),
+        restarts=sum(trial.restarted for trial in trials),
+        problems=problems,
+        ok=not problems,
+    )
+
+
+def _median_and_max(values: Sequence[float | None]) -> tuple[float | None, float | None]:
+    """Median and maximum of the values that are not None, to 0.01; None if there are none."""
+    there = [value for value in values if value is not None]
+    if not there:
+        return None, None
+    return round(float(np.median(there)), 2), round(max(there), 2)

@@ -61,7 +61,7 @@ class CameraEmulator:
         self.refused: set[str] = set()
         self.wanted: set[str] = {camera.stream for camera in cameras}
         """Streams with a client; no images are made for others."""
-        self.on_hang_up: Callable[[str, bool], None] = lambda stream, within: None
+        self.on_close_connections: Callable[[str, bool], None] = lambda stream, within: None
         """Called to close a stream's connections, at once or within the next image."""
         self._camera_lock = threading.Lock()
         self._heap_lock = threading.Lock()
@@ -70,7 +70,7 @@ class CameraEmulator:
         self.faults = FaultEngine(
             LANGUAGE, self, start_ns, check=self._check_names, log=self._log_fault, guard=self._camera_lock
         )
-        self._news: deque[CameraEvent] = deque(maxlen=EVENTS_KEPT)
+        self._new_events: deque[CameraEvent] = deque(maxlen=EVENTS_KEPT)
         self._count = 0
 
     def open(self) -> None:
@@ -139,15 +139,15 @@ class CameraEmulator:
     def _log_fault(self, t_ns: int, kind: str, command: CameraCommand, text: str) -> None:
         self.tell(t_ns, kind, command.camera, text)
 
-    def take_news(self) -> list[CameraEvent]:
+    def take_events(self) -> list[CameraEvent]:
         """Events since the last call."""
-        news = list(self._news)
-        self._news.clear()
-        return news
+        events = list(self._new_events)
+        self._new_events.clear()
+        return events
 
     def tell(self, t_ns: int, kind: str, camera: str, text: str = "") -> None:
         """Add an event."""
-        self._news.append(CameraEvent(t_ns, kind, camera, text))
+        self._new_events.append(CameraEvent(t_ns, kind, camera, text))
 
     def status(self) -> list[str]:
         """Status, one line a camera."""
@@ -182,9 +182,9 @@ class CameraEmulator:
         other = next(c for c in self.cameras if self._streams[c.name] == camera.stream)
         self.swap(camera, other)
 
-    def hang_up(self, stream: str, *, within: bool = False) -> None:
+    def close_connections(self, stream: str, *, within: bool = False) -> None:
         """Close the connections of a stream, at once or ``within`` the next image."""
-        self.on_hang_up(stream, within)
+        self.on_close_connections(stream, within)
 
 
 # -- fault commands ------------------------------------------------------------------------------------------
@@ -325,6 +325,26 @@ def _setter(answer: str, **marks: object) -> Callable[[CameraEmulator, CameraCom
     return _each(lambda emulator, camera, command: _set(camera, answer, **marks))
 
 
+def _by_command(
+    answer: Callable[[CameraCommand], str], **marks: Callable[[CameraCommand], object]
+) -> Callable[[CameraEmulator, CameraCommand], Answer]:
+    """Factory of actions that set fields of the condition to values of the command."""
+    return _each(
+        lambda emulator, camera, command: _set(
+            camera, answer(command), **{name: value(command) for name, value in marks.items()}
+        )
+    )
+
+
+_latency = _by_command(lambda c: f"latency {c.time_ns * 1e-6:g} ms", latency_ns=lambda c: c.time_ns)
+_jitter = _by_command(lambda c: f"jitter {c.time_ns * 1e-6:g} ms", jitter_ns=lambda c: c.time_ns)
+_exposure = _by_command(lambda c: f"exposure {c.number:g}", gain=lambda c: c.number)
+_lamp = _by_command(lambda c: f"lamp {c.what}", lamp=lambda c: c.what == "on")
+_resize = _by_command(lambda c: f"{c.size[0]}x{c.size[1]}", size=lambda c: c.size)
+_truncate = _by_command(lambda c: f"{c.number:g} JPEGs end in the middle", truncate=lambda c: int(c.number))
+_corrupt = _by_command(lambda c: f"{c.number:g} JPEGs spoilt", corrupt=lambda c: int(c.number))
+
+
 @_each
 def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     emulator.stalled.add(camera.stream)
@@ -333,31 +353,21 @@ def _stall(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComm
 
 @_each
 def _disconnect(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    emulator.hang_up(camera.stream)
+    emulator.close_connections(camera.stream)
     return "connections closed"
 
 
 @_each
 def _cut(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    emulator.hang_up(camera.stream, within=True)
+    emulator.close_connections(camera.stream, within=True)
     return "connections end in the middle of the next picture"
 
 
 @_each
 def _refuse(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
     emulator.refused.add(camera.stream)
-    emulator.hang_up(camera.stream)
+    emulator.close_connections(camera.stream)
     return "connections refused", lambda: emulator.refused.discard(camera.stream)
-
-
-@_each
-def _latency(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"latency {command.time_ns * 1e-6:g} ms", latency_ns=command.time_ns)
-
-
-@_each
-def _jitter(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"jitter {command.time_ns * 1e-6:g} ms", jitter_ns=command.time_ns)
 
 
 @_each
@@ -374,35 +384,10 @@ def _loss(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComma
     return f"loses {command.number:.0%} of its pictures", lambda: camera.view.change(drop_rate=before)
 
 
-@_each
-def _exposure(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"exposure {command.number:g}", gain=command.number)
-
-
-@_each
-def _lamp(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"lamp {command.what}", lamp=command.what == "on")
-
-
-@_each
-def _resize(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.size[0]}x{command.size[1]}", size=command.size)
-
-
 def _swap(emulator: CameraEmulator, command: CameraCommand) -> Answer:
     first, second = emulator.named(command.camera)[0], emulator.named(command.what)[0]
     emulator.swap(first, second)
     return f"{first.name} and {second.name}: swapped", lambda: emulator.swap(first, second)
-
-
-@_each
-def _truncate(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.number:g} JPEGs end in the middle", truncate=int(command.number))
-
-
-@_each
-def _corrupt(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraCommand) -> Answer:
-    return _set(camera, f"{command.number:g} JPEGs spoilt", corrupt=int(command.number))
 
 
 @_each
@@ -424,14 +409,6 @@ def _clear(emulator: CameraEmulator, camera: EmulatedCamera, command: CameraComm
         marks.discard(camera.stream)
     emulator.unswap(camera)
     return "as the cell file has it"
-
-
-def _status(emulator: CameraEmulator, command: CameraCommand) -> str:
-    return "\n".join(emulator.status())
-
-
-def _help(emulator: CameraEmulator, command: CameraCommand) -> str:
-    return "\n".join(LANGUAGE.help_lines())
 
 
 LANGUAGE = FaultLanguage(
@@ -497,9 +474,8 @@ LANGUAGE = FaultLanguage(
             _bump, parse=_bump_words,
         ),
         "clear": Verb("clear CAM", "takes back everything but `bump`", _clear, (CAMERA,)),
-        "status": Verb("status", "the state of all cameras", _status, logged=False),
-        "help": Verb("help", "this list", _help, logged=False),
     },
+    devices="cameras",
     example="freeze left",
     note="; CAM may be all",
 )  # fmt: skip

@@ -127,9 +127,7 @@ class EmulatedCamera:
     @staticmethod
     def _fresh(stream: StreamSettings) -> CameraCondition:
         return CameraCondition(
-            gain=stream.gain,
-            latency_ns=round(stream.latency_ms * 1e6),
-            jitter_ns=round(stream.jitter_ms * 1e6),
+            gain=stream.gain, latency_ns=round(stream.latency_ms * 1e6), jitter_ns=round(stream.jitter_ms * 1e6)
         )
 
     def open(self) -> None:

@@ -86,7 +86,7 @@ class CameraServer:
         self._listener.setblocking(False)
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
         self._selector.register(self._wake_read, selectors.EVENT_READ, self._woken)
-        emulator.on_hang_up = self._hang_up
+        emulator.on_close_connections = self._close_connections
         emulator.wanted.clear()
 
     @property
@@ -204,7 +204,7 @@ class CameraServer:
         self._pass_events()
 
     def _pass_events(self) -> None:
-        for event in self.emulator.take_news():
+        for event in self.emulator.take_events():
             if self.on_event is not None:
                 self.on_event(event)
 
@@ -314,7 +314,7 @@ class CameraServer:
         client.last = client.cut or client.once
         client.waiting = memoryview(data)
 
-    def _hang_up(self, stream: str, within: bool) -> None:
+    def _close_connections(self, stream: str, within: bool) -> None:
         for client in [client for client in self._clients if client.stream == stream]:
             if within:
                 client.cut = True

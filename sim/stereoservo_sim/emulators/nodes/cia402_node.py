@@ -10,8 +10,15 @@ from pathlib import Path
 
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_sim.emulators.nodes.communication import DEADLINE, ProcessData, SdoServer
-from stereoservo_sim.emulators.nodes.dictionary import Abort, Dictionary, SdoError, Value
+from stereoservo_sim.emulators.nodes.communication import (
+    DEADLINE,
+    Abort,
+    Dictionary,
+    ProcessData,
+    SdoError,
+    SdoServer,
+    Value,
+)
 from stereoservo_sim.emulators.nodes.drive_motion import (
     CYCLIC_VELOCITY,
     FOLLOWING_ERROR,
@@ -46,13 +53,7 @@ class Cia402Node:
     """
 
     def __init__(
-        self,
-        node_id: int,
-        axis: EmulatedAxis,
-        joint: CanJoint,
-        *,
-        eds: Path,
-        settings: NodeSettings | None = None,
+        self, node_id: int, axis: EmulatedAxis, joint: CanJoint, *, eds: Path, settings: NodeSettings | None = None
     ) -> None:
         self.node_id = node_id
         self.axis = axis
@@ -222,7 +223,7 @@ class Cia402Node:
 
     # -- the bus -------------------------------------------------------------------------------------------------
 
-    def hears(self, frame: CanFrame) -> bool:
+    def accepts(self, frame: CanFrame) -> bool:
         """See ``EmulatedNode``."""
         can_id = frame.id
         return (
@@ -326,10 +327,7 @@ class Cia402Node:
     def _settle(self) -> None:
         """Update motion, event-driven TPDOs and emergencies to the present."""
         t_ns = self._t_ns
-        if self.motion.step(t_ns) and self.machine.state not in (
-            Cia402State.FAULT_REACTION,
-            Cia402State.FAULT,
-        ):
+        if self.motion.step(t_ns) and self.machine.state not in (Cia402State.FAULT_REACTION, Cia402State.FAULT):
             self._fault(FOLLOWING_ERROR)
             self.motion.step(t_ns)
         self.motion.warning = bool(self.emergencies.active)

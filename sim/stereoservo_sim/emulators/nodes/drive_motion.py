@@ -10,7 +10,7 @@ from collections.abc import Callable
 from enum import Enum, IntEnum, StrEnum
 
 from stereoservo_drivers.canopen.options import CanJoint
-from stereoservo_sim.emulators.nodes.dictionary import Dictionary
+from stereoservo_sim.emulators.nodes.communication import Dictionary
 from stereoservo_sim.emulators.nodes.node import NEVER_NS, EmulatedAxis, NodeSettings
 from stereoservo_sim.world.velocity_drives import REST_VELOCITY
 
@@ -120,11 +120,7 @@ class PowerMachine:
     @property
     def powered(self) -> bool:
         """Whether the power stage is on."""
-        return self.opening or self.state in (
-            Cia402State.ENABLED,
-            Cia402State.QUICK_STOP,
-            Cia402State.FAULT_REACTION,
-        )
+        return self.opening or self.state in (Cia402State.ENABLED, Cia402State.QUICK_STOP, Cia402State.FAULT_REACTION)
 
     @property
     def halted(self) -> bool:
@@ -234,8 +230,7 @@ class PowerMachine:
             self._enter(Cia402State.QUICK_STOP)  # 11
             option = self._option(QUICK_STOP_OPTION)
             self._stop(
-                Ramp(option - 4 if option > 4 else option),
-                None if option > 4 else Cia402State.SWITCH_ON_DISABLED,
+                Ramp(option - 4 if option > 4 else option), None if option > 4 else Cia402State.SWITCH_ON_DISABLED
             )
         elif given is Command.SHUTDOWN:
             self._stop(Ramp(self._option(SHUTDOWN_OPTION)), Cia402State.READY)  # 8
@@ -293,12 +288,7 @@ class DriveMotion:
     """Moves one axis by the power state machine and the objects; computes the measured objects."""
 
     def __init__(
-        self,
-        axis: EmulatedAxis,
-        joint: CanJoint,
-        dictionary: Dictionary,
-        machine: PowerMachine,
-        settings: NodeSettings,
+        self, axis: EmulatedAxis, joint: CanJoint, dictionary: Dictionary, machine: PowerMachine, settings: NodeSettings
     ) -> None:
         self.axis = axis
         self.machine = machine

@@ -80,7 +80,7 @@ class EmulatedNode(Protocol):
         """Boot or reboot, with a boot-up frame; the axis loses its power."""
         ...
 
-    def hears(self, frame: CanFrame) -> bool:
+    def accepts(self, frame: CanFrame) -> bool:
         """Whether a frame is relevant to it; others need not be given to ``receive``."""
         ...
 

@@ -88,7 +88,7 @@ class OdriveNode:
         self._queue.clear()
         self._boot_end_ns = t_ns + self.settings.boot_ns
 
-    def hears(self, frame: CanFrame) -> bool:
+    def accepts(self, frame: CanFrame) -> bool:
         """Whether a frame is relevant: every frame, since each updates the encoder."""
         return True
 

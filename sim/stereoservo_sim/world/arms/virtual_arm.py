@@ -35,11 +35,7 @@ def virtual_robot(robot: Robot, tool: FloatArray, attitude: FloatArray, joints: 
 
 
 def virtual_cell(
-    cell: SimulatedCell,
-    tool: FloatArray,
-    attitude: FloatArray,
-    joints: tuple[JointSpec, ...],
-    base: FloatArray,
+    cell: SimulatedCell, tool: FloatArray, attitude: FloatArray, joints: tuple[JointSpec, ...], base: FloatArray
 ) -> SimulatedCell:
     """``cell`` with its arm replaced by six virtual ``joints``, laid out around ``base`` (6,)."""
     return replace(cell, robot=virtual_robot(cell.robot, tool, attitude, joints), base=base)

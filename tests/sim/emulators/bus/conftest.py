@@ -40,7 +40,7 @@ class ScriptedNode:
         self._out.append(CanFrame(0x700 + self.node_id, b"\0"))
         self._beat = t_ns + self.beat_ns
 
-    def hears(self, frame: CanFrame) -> bool:
+    def accepts(self, frame: CanFrame) -> bool:
         return True
 
     def receive(self, frame: CanFrame, t_ns: int) -> None:

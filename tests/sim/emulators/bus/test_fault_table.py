@@ -8,9 +8,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stereoservo_sim.emulators.bus.fault_cases import CASES, CIA402_CASES, FaultCase
-from stereoservo_sim.emulators.bus.fault_table import run_row, sum_up, trial_rng
-from stereoservo_sim.emulators.bus.fault_trials import FaultRig, Trial, run_trial, trial_speed
+from stereoservo_sim.emulators.bus.fault_trials import (
+    CASES,
+    CIA402_CASES,
+    FaultCase,
+    FaultRig,
+    Trial,
+    run_row,
+    run_trial,
+    summarize,
+    trial_rng,
+    trial_speed,
+)
 
 ALL = [
     pytest.param(protocol, case, id=f"{protocol}: {case.name}") for protocol, cases in CASES.items() for case in cases
@@ -72,7 +81,7 @@ def test_a_row_tells_its_worst_trial():
     case = case_named("node silent")
     good = Trial(detected_ms=14.0, rest_ms=30.0, code="silent", restarted=False, problem="")
     bad = Trial(detected_ms=19.0, rest_ms=70.0, code="late", restarted=True, problem="at rest after 70.0 ms")
-    row = sum_up(case, "cia402", [good, good, bad])
+    row = summarize(case, "cia402", [good, good, bad])
     assert (row.detected_ms_median, row.detected_ms_max, row.detected_cycles) == (14.0, 19.0, 5)
     assert (row.rest_ms_median, row.rest_ms_max) == (30.0, 70.0)
     assert row.codes == {"silent": 2, "late": 1}

@@ -13,8 +13,7 @@ from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.emulators.bus.factory import drives_of_cell, make_bus_emulator
 from stereoservo_sim.emulators.fault_engine import EmulationError
-from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of
-from stereoservo_sim.world.arms.urdf_file import urdf_path
+from stereoservo_sim.world.arms.arm_cell import ArmPlace, cell_of, urdf_path
 
 SCARA = cell_of(ArmPlace(urdf="scara.urdf"), "eye_to_hand", Path())
 

@@ -106,7 +106,7 @@ def test_what_lasts_ends_by_itself(make_bench):
     bench.run(0.1)
     after = bench.run(0.2)
     assert len({picture.data for _, _, picture in after}) == len(after) >= 5
-    assert [event.kind for event in bench.emulator.take_news()] == ["order", "ended"]
+    assert [event.kind for event in bench.emulator.take_events()] == ["order", "ended"]
 
 
 def test_orders_wait_for_their_time(make_bench):

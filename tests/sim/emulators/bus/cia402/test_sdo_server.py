@@ -9,8 +9,7 @@ from canopen.sdo import SdoAbortedError
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo_sim.emulators.nodes.communication import SdoServer
-from stereoservo_sim.emulators.nodes.dictionary import Dictionary
+from stereoservo_sim.emulators.nodes.communication import Dictionary, SdoServer
 
 SMALL = Path(__file__).parent / "small.eds"
 NODE = 5

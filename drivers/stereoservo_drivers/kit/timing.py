@@ -13,6 +13,8 @@ from collections.abc import Callable
 from types import TracebackType
 from typing import Self
 
+from stereoservo.ports.devices import DriverError, JointState
+
 LOOKS = 5
 """Number of checks of the watchdog per time-out."""
 SLEEP_S = 0.01
@@ -83,3 +85,66 @@ class StallWatch:
     ) -> None:
         self._ended.set()
         self._thread.join()
+
+
+# -- freshness of samples --------------------------------------------------------------------------------------
+
+
+class Freshness:
+    """Stores the newest sample. If it is older than ``limit_s``, reading it is a fault."""
+
+    def __init__(self, limit_s: float) -> None:
+        self._limit_ns = round(limit_s * 1e9)
+        self._newest: JointState | None = None
+
+    def put(self, sample: JointState) -> JointState:
+        """Store a new sample, and return it."""
+        self._newest = sample
+        return sample
+
+    def newest(self, now_ns: int) -> JointState:
+        """The newest sample. Raises DriverError: ``no_sample`` before the first, ``stale`` beyond the limit."""
+        if self._newest is None:
+            raise DriverError("no_sample", "the device has told no positions yet", retry=True)
+        age_ns = now_ns - self._newest.t_ns
+        if age_ns > self._limit_ns:
+            raise DriverError(
+                "stale",
+                f"the newest positions are {age_ns * 1e-6:.0f} ms old, {self._limit_ns * 1e-6:.0f} ms are allowed; is "
+                "the device powered and its cable whole?",
+                retry=True,
+                age_ms=age_ns * 1e-6,
+            )
+        return self._newest
+
+
+# -- clocks of devices -----------------------------------------------------------------------------------------
+
+
+class DeviceClock:
+    """Converts times of a device's own clock to ``context.clock``, by the samples with the shortest delay.
+
+    ``drift``: upper bound of the relative drift of the two clocks. The delay of the fastest sample remains in the
+    stamps, which are late by it.
+    """
+
+    def __init__(self, drift: float = 2e-4) -> None:
+        self._drift = drift
+        self._offset_ns = self._device_ns = self._stamp_ns = 0
+
+    def stamp(self, device_s: float, now_ns: int) -> int:
+        """Time [ns] of the sample that the device measured at its own time ``device_s`` and that was received at
+        ``now_ns``.
+
+        It is never later than ``now_ns`` and never goes back. A device whose time goes back has restarted.
+        """
+        device_ns = round(device_s * 1e9)
+        lateness_ns = now_ns - device_ns
+        if not self._stamp_ns or device_ns < self._device_ns:
+            self._offset_ns = lateness_ns
+        else:
+            widened_ns = self._offset_ns + round(self._drift * (device_ns - self._device_ns))
+            self._offset_ns = min(widened_ns, lateness_ns)
+        self._device_ns = device_ns
+        self._stamp_ns = max(self._stamp_ns, device_ns + self._offset_ns)
+        return self._stamp_ns

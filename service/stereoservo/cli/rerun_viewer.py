@@ -74,9 +74,7 @@ class RerunViewer:
         for entity, rows in series.items():
             scalars = rerun.Scalars.columns(scalars=[value for _, values in rows for value in values])
             self._stream.send_columns(
-                entity,
-                [_times([t_wall for t_wall, _ in rows])],
-                scalars.partition([len(values) for _, values in rows]),
+                entity, [_times([t_wall for t_wall, _ in rows])], scalars.partition([len(values) for _, values in rows])
             )
         frames, self._frames = self._frames, {}
         for camera, seen in frames.items():

@@ -83,14 +83,7 @@ def state_channels(state: StateMessage, t_ns: int) -> list[Published]:
     velocities = [state.velocities[name] for name in names] if len(state.velocities) == len(names) else None
     efforts = [state.efforts[name] for name in names] if len(state.efforts) == len(names) else None
     return [
-        joints(
-            "/joints",
-            t_ns,
-            names,
-            positions=list(state.joints.values()),
-            velocities=velocities,
-            efforts=efforts,
-        ),
+        joints("/joints", t_ns, names, positions=list(state.joints.values()), velocities=velocities, efforts=efforts),
         joints("/command", t_ns, list(state.command), velocities=list(state.command.values())),
         Published("/status", t_ns, cell_status(state)),
     ]

@@ -13,15 +13,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, note
+from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit, log
 from stereoservo.cli.status import progress_words
 from stereoservo.client import Client
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, StateMessage
 
 if TYPE_CHECKING:
-    from stereoservo.cli.watch.foxglove_server import FoxgloveServer
-    from stereoservo.cli.watch.rerun_viewer import RerunViewer
+    from stereoservo.cli.foxglove_server import FoxgloveServer
+    from stereoservo.cli.rerun_viewer import RerunViewer
 
 STATE_EVERY_S = 1.0
 RUNTIME = "(rx: (handover: app), app: (worker_threads: 1))"
@@ -76,15 +76,13 @@ def _viewers(
     """The requested viewers; ``opened`` closes them."""
     found: list[FoxgloveServer | RerunViewer] = []
     if port is not None:
-        from stereoservo.cli.watch.foxglove_server import (
-            FoxgloveServer,
-        )  # of the extra `cell`: only for this
+        from stereoservo.cli.foxglove_server import FoxgloveServer  # of the extra `cell`: only for this
 
         server = opened.enter_context(FoxgloveServer(cell, port))
-        note(f"in Foxglove: Open connection, ws://localhost:{server.port}")
+        log(f"in Foxglove: Open connection, ws://localhost:{server.port}")
         found.append(server)
     if rerun:
-        from stereoservo.cli.watch.rerun_viewer import RerunViewer  # of the extra `watch`: only for this
+        from stereoservo.cli.rerun_viewer import RerunViewer  # of the extra `watch`: only for this
 
         found.append(opened.enter_context(RerunViewer(cell, save)))
     return found
