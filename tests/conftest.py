@@ -115,11 +115,14 @@ STARTED_NS = pytest.StashKey[int]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """One process watches for stalls of the machine, for all workers."""
+    """One process watches for stalls of the machine, for all workers; and one folder keeps the models that any of them
+    has learnt: none of the user's are read, and each is learnt once a run.
+    """
     if hasattr(config, "workerinput"):
         return
-    folder = tempfile.TemporaryDirectory(prefix="ssstalls")
+    folder = tempfile.TemporaryDirectory(prefix="ssrun")
     os.environ[STALLS] = str(Path(folder.name) / "stalls")
+    os.environ["STEREOSERVO_CACHE_DIR"] = str(Path(folder.name) / "cache")
     watch = subprocess.Popen([sys.executable, machine_stalls.__file__, os.environ[STALLS]], stdin=subprocess.PIPE)
 
     def end() -> None:

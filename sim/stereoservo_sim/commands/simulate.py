@@ -117,6 +117,9 @@ def simulate(
         bool,
         typer.Option(help="The law alone, without goal, monitors and safety stage; the arm free has no others."),
     ] = False,
+    learn: Annotated[
+        bool, typer.Option("--learn", help="self: learn anew, although a model of the same trial motions is kept.")
+    ] = False,
     draw: Draw = None,
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None,
     ids: Annotated[str | None, typer.Option(help="Only these tasks: ids by commas.")] = None,
@@ -128,6 +131,7 @@ def simulate(
     """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.kept_models import learning_anew
     from stereoservo_sim.tasks.closed_loop import LoopSettings
 
     settings = LoopSettings(
@@ -145,7 +149,8 @@ def simulate(
         mechanics=_mechanics(mechanics, arm),
         core=_by_core(arm, law_only, calibration, centre),
     )
-    answer = _answer(_given(tasks, draw, seed), limit, ids, settings, jobs)
+    with learning_anew(learn):
+        answer = _answer(_given(tasks, draw, seed), limit, ids, settings, jobs)
     answer = {"file": None if tasks is None else str(tasks), "draw": draw, **answer}
     if as_json:
         sys.stdout.write(json.dumps(answer, allow_nan=False) + "\n")
@@ -270,6 +275,9 @@ def _show(answer: dict[str, Any], console: Console) -> None:
     for key, (name, unit) in SHOWN.items():
         if answer[key] is not None:
             console.print(f"{name}: median {answer[key]['median']:.3g}{unit}, max {answer[key]['max']:.3g}{unit}")
+    if model := answer["calibration"].get("model"):
+        source = f"kept in {model['file']}; --learn learns anew" if model["kept"] else "by this command"
+        console.print(f"model learnt {model['learnt']}, {source}", soft_wrap=True)
     console.print(f"{answer['seconds']:.1f} s")
 
 
