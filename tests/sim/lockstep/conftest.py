@@ -74,6 +74,12 @@ def shown_goal(cell_file: CellFile, folder: Path) -> tuple[CellModel, Any]:
 
 
 @pytest.fixture(scope="session")
+def fake_file() -> CellFile:
+    """The fake cell."""
+    return fake_cell()
+
+
+@pytest.fixture(scope="session")
 def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any]:
     """A model of the fake cell and a goal that was shown to it."""
     return shown_goal(fake_cell(), tmp_path_factory.mktemp("calibrated"))

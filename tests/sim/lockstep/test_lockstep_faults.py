@@ -34,14 +34,13 @@ from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.daemon.vision import VisionSlots
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.cell_file import CellFile
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Disable, Enable, Goal, Jog, Request, Reset, RunGoal
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, DriverError, JointState
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.world.history import TrueJointHistory
-
-from .conftest import fake_cell
 
 CAMERAS = ("left", "right")
 BOUND_S = 1.5  # coast (0.5) + braking from full speed (0.25) + drives' time-out (0.1), generously
@@ -111,11 +110,11 @@ LINKS: dict[str, Callable[[Path], Any]] = {
 class Flight:
     """A cell on its way to a goal, and the truth about its arm."""
 
-    def __init__(self, directory: Path, links: LockstepLinks, model: CellModel, target: Any) -> None:
+    def __init__(self, directory: Path, links: LockstepLinks, file: CellFile, model: CellModel, target: Any) -> None:
         self.links: Any = links
         self.history = TrueJointHistory.in_memory(6, capacity=1 << 14)
         self.cell = LockstepCell(
-            fake_cell(),
+            file,
             cell_dir=directory,
             runtime_dir=directory,
             services={"world": self.history},
@@ -177,9 +176,11 @@ class Flight:
 
 
 @pytest.fixture(params=LINKS)
-def flight(request: pytest.FixtureRequest, calibrated: tuple[CellModel, Any], tmp_path: Path) -> Iterator[Flight]:
+def flight(
+    request: pytest.FixtureRequest, fake_file: CellFile, calibrated: tuple[CellModel, Any], tmp_path: Path
+) -> Iterator[Flight]:
     """A cell on its way to the goal, on each kind of links."""
-    flight = Flight(tmp_path, LINKS[request.param](tmp_path), *calibrated)
+    flight = Flight(tmp_path, LINKS[request.param](tmp_path), fake_file, *calibrated)
     yield flight
     flight.cell.close()
 
