@@ -32,6 +32,8 @@ NOT_FAST = {
     "control/test_cartesian2.py",
     "control/test_pd.py",
     "control/test_sight.py",
+    "core/test_allocations.py",
+    "core/test_corrupted_inputs.py",
     "core/test_goal_attacks.py",
     "core/test_goal_kinds.py",
     "core/test_goal_life.py",
