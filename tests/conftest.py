@@ -1,5 +1,7 @@
 """Settings of the whole suite."""
 
+import ast
+import functools
 import os
 import resource
 import socket
@@ -30,6 +32,8 @@ NOT_FAST = {
     "control/test_cartesian2.py",
     "control/test_pd.py",
     "control/test_sight.py",
+    "core/test_allocations.py",
+    "core/test_corrupted_inputs.py",
     "core/test_goal_attacks.py",
     "core/test_goal_kinds.py",
     "core/test_goal_life.py",
@@ -90,20 +94,39 @@ def in_real_time(item: pytest.Item) -> bool:
     return item.get_closest_marker("process") is not None or bool(getattr(suite, "real_time", False))
 
 
-class LiveFilesInTurn(LoadFileScheduling):
-    """Files with tests of real processes run one after another on one worker: two live cells at once are more than
-    two cores carry, and then either is stopped for the other's sake.
+class LiveTestsInTurn(LoadFileScheduling):
+    """Tests of real processes run one after another on one worker: two live cells at once are more than two cores
+    carry, and then either is stopped for the other's sake. The others of their files need not wait for them.
     """
 
     def _split_scope(self, nodeid: str) -> str:
-        file = super()._split_scope(nodeid)
-        return "live" if "pytest.mark.process" in (self.config.rootpath / file).read_text("utf-8") else file
+        file, *names = nodeid.split("::")
+        live = live_names(self.config.rootpath / file)
+        return "live" if live & {"", *(name.partition("[")[0] for name in names)} else file
+
+
+@functools.cache
+def live_names(file: Path) -> frozenset[str]:
+    """Names of the functions and classes of a file with the marker `process`, and '' if the whole file has it."""
+    found = set()
+    tree = ast.parse(file.read_text("utf-8"))
+    for owner in ast.walk(tree):
+        marks: list[ast.expr] = list(getattr(owner, "decorator_list", ()))
+        if isinstance(owner, ast.Module | ast.ClassDef):
+            marks += [
+                assigned.value
+                for assigned in owner.body
+                if isinstance(assigned, ast.Assign) and ast.unparse(assigned.targets[0]) == "pytestmark"
+            ]
+        if any("pytest.mark.process" in ast.unparse(mark) for mark in marks):
+            found.add(getattr(owner, "name", ""))
+    return frozenset(found)
 
 
 @pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveFilesInTurn:
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> LiveTestsInTurn:
     """Which worker runs which test."""
-    return LiveFilesInTurn(config, log)
+    return LiveTestsInTurn(config, log)
 
 
 STALLS = "STEREOSERVO_TESTS_STALLS"
@@ -115,11 +138,14 @@ STARTED_NS = pytest.StashKey[int]()
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """One process watches for stalls of the machine, for all workers."""
+    """One process watches for stalls of the machine, for all workers; and one folder keeps the models that any of them
+    has learnt: none of the user's are read, and each is learnt once a run.
+    """
     if hasattr(config, "workerinput"):
         return
-    folder = tempfile.TemporaryDirectory(prefix="ssstalls")
+    folder = tempfile.TemporaryDirectory(prefix="ssrun")
     os.environ[STALLS] = str(Path(folder.name) / "stalls")
+    os.environ["STEREOSERVO_CACHE_DIR"] = str(Path(folder.name) / "cache")
     watch = subprocess.Popen([sys.executable, machine_stalls.__file__, os.environ[STALLS]], stdin=subprocess.PIPE)
 
     def end() -> None:

@@ -93,11 +93,19 @@ def test_it(k):
 """
 
 
-def test_files_with_processes_run_on_one_worker(pytester: pytest.Pytester) -> None:
+def test_tests_of_processes_run_on_one_worker_and_the_others_of_their_files_do_not_wait(
+    pytester: pytest.Pytester,
+) -> None:
     settings_of_the_suite(pytester)
-    pytester.makepyfile(test_one=LIVE, test_two=LIVE, test_three=LIVE)
-    pytester.runpytest_subprocess("-n", "2").assert_outcomes(passed=12)
-    assert len(set((pytester.path / "workers").read_text().split())) == 1
+    beside = LIVE.replace("@pytest.mark.process\n", "").replace("test_it", "test_beside").replace("workers", "beside")
+    whole = beside.replace("test_beside", "test_marked").replace('"beside"', '"workers"')
+    pytester.makepyfile(
+        test_one=LIVE + beside, test_two=LIVE + beside, test_three=f"{whole}\npytestmark = [pytest.mark.process]\n"
+    )
+    pytester.runpytest_subprocess("-n", "2").assert_outcomes(passed=20)
+    live, others = (set((pytester.path / name).read_text().split()) for name in ("workers", "beside"))
+    assert len(live) == 1
+    assert others - live
 
 
 def settings_of_the_suite(pytester: pytest.Pytester) -> None:

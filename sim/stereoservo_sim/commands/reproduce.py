@@ -24,15 +24,30 @@ COMMON = {
         None,
         Annotated[Path | None, typer.Option(help="all: write one page with every table and figure.")],
     ),
+    "learn": (
+        False,
+        Annotated[bool, typer.Option("--learn", help="Learn anew what is kept of earlier runs; docs/simulation.md.")],
+    ),
     "as_json": (False, Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]),
 }
 """Options that every experiment takes: default and type."""
 
 
-def reproduce(experiment: str, seed: int, plot: Path | None, html: Path | None, as_json: bool, **given: Any) -> None:
+def reproduce(
+    experiment: str, seed: int, plot: Path | None, html: Path | None, learn: bool, as_json: bool, **given: Any
+) -> None:
     """Run an experiment again and print our figures beside those to compare with."""
     # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    from stereoservo_sim.kept_models import learning_anew
+
+    with learning_anew(learn):
+        _reproduce(experiment, seed, plot, html, as_json, given)
+
+
+def _reproduce(
+    experiment: str, seed: int, plot: Path | None, html: Path | None, as_json: bool, given: dict[str, Any]
+) -> None:
     try:
         if experiment == ALL:
             _all(seed, plot, html, as_json, given)

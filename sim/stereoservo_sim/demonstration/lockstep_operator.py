@@ -98,7 +98,7 @@ class LockstepOperator:
         self.trials = self._measure(check=False)
         self._epoch += 1
         model = fit_model(self.trials, epoch=self._epoch, progress=progress).model
-        self._send_model(model)
+        self.use_model(model)
         return model
 
     def check(self, model: CellModel) -> CheckReport:
@@ -115,14 +115,15 @@ class LockstepOperator:
         report = make_check_report(examined, limit_px=self.cell.settings.tolerance_px)
         self._epoch += 1
         cured, reset = reset_zeros(examined, report, epoch=self._epoch)
-        self._send_model(cured)
+        self.use_model(cured)
         return cured, reset
 
-    def _send_model(self, model: CellModel) -> None:
+    def use_model(self, model: CellModel) -> None:
+        """Send a model to the core, and wait until it is in use. Raises LockstepTimeoutError."""
         since = self._last_event
         self.cell.update_model(ModelUpdate(model))
         self.cell.wait_for(lambda e: e.kind == "model" and self.cell.status.model_epoch == model.epoch, 5.0, since)
-        self._body = model.marker_ids
+        self._epoch, self._body = model.epoch, model.marker_ids
 
     @property
     def _last_event(self) -> int:

@@ -28,7 +28,6 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo.kinematics.model import CellModel
@@ -36,6 +35,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import ExperimentError, cases, crossed
 from stereoservo_sim.experiments.figures import drawing_sorted
 from stereoservo_sim.experiments.random_rigs import simulated_trials
+from stereoservo_sim.kept_models import model_of_trials
 from stereoservo_sim.progress import ProgressCall, counted, silent
 from stereoservo_sim.summaries import count_row
 from stereoservo_sim.tasks.driven_cell import RATE_HZ, TOLERANCE_PX, Creep, DrivenCell, GoalEnd, Imperfections
@@ -138,7 +138,7 @@ def model_of(case: RandomCase, wrong: Imperfections, kind: str) -> CellModel:
 def learnt_model(case: RandomCase, wrong: Imperfections) -> CellModel:
     """The model of the arm's own calibration motion. Raises CalibrationError."""
     assert wrong.mechanics is not None
-    return fit_model(simulated_trials(case, wrong.mechanics, wrong.noise_px), epoch=1).model
+    return model_of_trials(simulated_trials(case, wrong.mechanics, wrong.noise_px)).model
 
 
 def places_in_view(

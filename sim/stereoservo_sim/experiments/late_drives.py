@@ -32,6 +32,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import cases, crossed
 from stereoservo_sim.experiments.figures import Figures, drawing_sorted, sorted_values
 from stereoservo_sim.experiments.imperfect_arms import farthest, places_in_view
+from stereoservo_sim.kept_models import kept_model
 from stereoservo_sim.progress import ProgressCall, silent
 from stereoservo_sim.summaries import count_row
 from stereoservo_sim.tasks.driven_cell import TOLERANCE_PX, DrivenCell, GoalEnd, Imperfections
@@ -90,7 +91,11 @@ def judged_drives(seed: int) -> DriveVerdict:
 
 def _learnt_by_core(case: RandomCase, wrong: Imperfections) -> CellModel:
     """The model of the calibration motion driven by the servo core. Raises CalibrationError."""
-    return fit_model(DrivenCell(case.cell, None, case.cell.home, case.seed, wrong).trials(), epoch=1).model
+
+    def learn() -> CellModel:
+        return fit_model(DrivenCell(case.cell, None, case.cell.home, case.seed, wrong).trials(), epoch=1).model
+
+    return kept_model(("driven by the core", case.cell, case.seed, wrong), learn).model
 
 
 def _driven_to(driven: DrivenCell, goal: FloatArray) -> tuple[str, float]:

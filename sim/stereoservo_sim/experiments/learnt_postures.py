@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.inverse.postures import Postures, postures
 from stereoservo.kinematics.inverse.recognition import recognise
 from stereoservo.kinematics.inverse.solutions import InverseKinematicsError
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.benchmarks.timing import summary
+from stereoservo_sim.kept_models import model_of_trials
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
@@ -56,7 +56,7 @@ def run_ik(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any
 
 def family(name: str, cell: SyntheticCell, poses: int, rng: np.random.Generator) -> dict[str, Any]:
     """The figures of one family, for ``poses`` goals on the model that its arm learns."""
-    learnt, exact = fit_model(cell.trials(SIGMA, rng, STOPS), epoch=1).model, exact_model(cell)
+    learnt, exact = model_of_trials(cell.trials(SIGMA, rng, STOPS)).model, exact_model(cell)
     began = time.perf_counter()
     known = recognise(learnt)
     recognition_s = time.perf_counter() - began

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from stereoservo.calibration.self_calibration import fit_model
+from stereoservo.calibration.trial_data import TrialData
 from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo.ports.devices import Frame, Prior
 from stereoservo.ports.dot_plates import CORNERS, seven_dots
@@ -23,6 +24,7 @@ from stereoservo_sim.experiments.driven_tasks import decay, image_errors, images
 from stereoservo_sim.experiments.experiment import Comparison, of_statement
 from stereoservo_sim.experiments.figures import COLOURS, Figures, draw_images, labelled, picture
 from stereoservo_sim.experiments.textured import context_of, prior_at
+from stereoservo_sim.kept_models import kept_model
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.tasks.arms import PLATE_ON_FLANGE, rx90_cell, rx90_reach
 from stereoservo_sim.tasks.calibrations import (
@@ -50,6 +52,7 @@ from stereoservo_sim.tasks.task_file import AlignmentTask
 from stereoservo_sim.world.body import MarkerBody
 from stereoservo_sim.world.camera_rig import PinholeCamera
 from stereoservo_sim.world.rendering import draw_faces
+from stereoservo_sim.world.synthetic import SyntheticCell
 
 FACE = seven_dots("plate", 0, 0.66, ((0.25, 0.40), (0.66, 0.49)), side=float(np.ptp(MARKERS[:, 0])))
 """The plate's face. Its corner dots are the tasks' markers; the three others identify them."""
@@ -178,6 +181,12 @@ PICTURES_ASSUMED = [
 def pictured_calibration(seed: int) -> TaskCalibration:
     """The RX 90's model learnt from rendered images of its calibration motion. Raises CalibrationError."""
     cell = with_trial_ranges(rx90_cell())
+    learnt = kept_model(("rx90 in pictures", seed), lambda: fit_model(pictured_trials(cell, seed), epoch=1).model)
+    return TaskCalibration("rx90", cell, learnt.model, {"model": learnt.facts})
+
+
+def pictured_trials(cell: SyntheticCell, seed: int) -> TrialData:
+    """Trial motions of ``cell`` with the markers as detected in rendered images."""
     rng = np.random.default_rng([seed, 20])
     pictures = PlatePictures(predicts=True)
     trials = cell.trials(DETECTED_PX, rng, STOPS)
@@ -185,8 +194,7 @@ def pictured_calibration(seed: int) -> TaskCalibration:
     for k, q in enumerate(trials.positions):
         found, seen = pictures.extracted(cell.flange(q) @ PLATE_ON_FLANGE, None, rng)
         pixels[:, k] = np.where(seen[..., None] > 0.0, found, np.nan)
-    result = fit_model(msgspec.structs.replace(trials, pixels=pixels), epoch=1)
-    return TaskCalibration("rx90", cell, result.model, {"rms_px": result.report.rms_px})
+    return msgspec.structs.replace(trials, pixels=pixels)
 
 
 def through_pictures(

@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.geometry.cameras import camera_centre
 from stereoservo.geometry.displacements import conjugate
 from stereoservo.geometry.screws import exp_twist
@@ -26,6 +25,7 @@ from stereoservo.kinematics.composition import Composition
 from stereoservo.kinematics.kernels import chain_forward
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo_sim.kept_models import model_of_trials
 from stereoservo_sim.tasks.arms import MID_RANGE, ArmName, free_cell, mechanics_of, rx90_cell
 from stereoservo_sim.tasks.options import FRAMES, STOPS
 from stereoservo_sim.tasks.setting import (
@@ -130,8 +130,8 @@ def self_calibrated(
     seed: int,
     mechanics: MechanicsPreset | None = None,
 ) -> TaskCalibration:
-    """Model from a calibration motion about the cell's home, of a serial arm with ``mechanics``. Raises
-    CalibrationError.
+    """Model from a calibration motion about the cell's home, of a serial arm with ``mechanics``; a kept one if the same
+    motion was learnt from before. Raises CalibrationError.
     """
     started = time.perf_counter()
     cell = with_trial_ranges(cell)
@@ -139,17 +139,19 @@ def self_calibrated(
     sigma = max(noise_px / np.sqrt(FRAMES), LEAST_SIGMA_PX)
     gears = mechanics_of(mechanics)
     trials = cell.trials(sigma, rng, STOPS) if gears is None else mechanical_trials(cell, gears, sigma, rng, STOPS)
-    result = fit_model(trials, epoch=1)
+    learnt = model_of_trials(trials)
+    assert learnt.model.statistics is not None
     facts = {
         "stops_per_joint": STOPS,
         "frames_per_stop": FRAMES,
         "ranges": [round(float(value), 4) for value in cell.ranges],
         "sigma_px": sigma,
-        "rms_px": result.report.rms_px,
-        "stratum": result.model.stratum,
+        "rms_px": learnt.model.statistics.rms_px,
+        "stratum": learnt.model.stratum,
+        "model": learnt.facts,
         "seconds": round(time.perf_counter() - started, 3),
     }
-    return TaskCalibration(arm, cell, result.model, facts)
+    return TaskCalibration(arm, cell, learnt.model, facts)
 
 
 def with_trial_ranges(cell: SyntheticCell) -> SyntheticCell:

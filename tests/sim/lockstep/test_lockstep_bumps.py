@@ -12,75 +12,18 @@ import pytest
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.cell_file import CellFile, check_cell
-from stereoservo.messages.goals import Goal, JointTarget, RunGoal
+from stereoservo.messages.goals import Goal, RunGoal
 from stereoservo.recording.replay import replay
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.simulated_cell import demo_cell, workpiece_cell
+from stereoservo_sim.world.simulated_cell import demo_cell
 from stereoservo_sim.world.workpiece import Moved
 
-NAMES = tuple(f"j{k}" for k in range(1, 7))
-GOAL = np.radians([4.0, -83.0, -29.0, -24.0, 53.0, -90.0])
+from .conftest import GOAL, fake_cell
+
 BUMP = Moved((0.03, 0.0, 0.0), (0.0, 5.0, 0.0))
 IN_VIEW = {0: Moved((0.03, 0.0, 0.0), (0.0, -5.0, 0.0)), 1: Moved((0.0, 0.02, 0.01), (3.0, -2.0, 1.0))}
 """Bumps of both cameras, each its own, after which either still sees the plate."""
-
-
-def fake_cell(*, static: bool = False, **camera: Any) -> CellFile:
-    """Two cameras without pictures; ``static``: a plate stands beside the arm for good."""
-    base = demo_cell().base
-    plate = workpiece_cell().workpiece
-    assert plate is not None
-    camera = {**camera, "workpiece": True} if static else camera
-    return check_cell(
-        {
-            "schema": 1,
-            "scene": {"static": plate.body.ids.tolist() if static else []},
-            "cell": {"name": "bumps"},
-            "joints": {"driver": "fake"},
-            "camera": [{"name": name, "driver": "fake", "options": camera} for name in ("left", "right")],
-            "servo": {"tolerance_px": 0.2, "hold_frames": 5},
-            "safety": {
-                "limit": [
-                    {"joint": n, "min": -m, "max": m, "velocity": 1.0, "acceleration": 4.0}
-                    for n, m in zip(NAMES, (2.7, 2.3, 2.4, 4.7, 1.8, 4.7), strict=True)
-                ]
-            },
-            "calibration": {
-                "base": dict(zip(NAMES, base.tolist(), strict=True)),
-                "range": dict(zip(NAMES, [0.3, 0.3, 0.3, 0.7, 0.6, 0.7], strict=True)),
-                "stops": 7,
-                "frames": 2,
-                "settle_s": 0.05,
-                "speed_scale": 1.0,
-            },
-        }
-    )
-
-
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any]:
-    """A model of the fake cell and a goal that was shown to it."""
-    return calibrate(tmp_path_factory.mktemp("calibrated"), static=False)
-
-
-@pytest.fixture(scope="module")
-def calibrated_with_plate(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any]:
-    """The same of the cell beside whose arm a plate stands for good."""
-    return calibrate(tmp_path_factory.mktemp("calibrated-with-plate"), static=True)
-
-
-def calibrate(directory: Path, *, static: bool) -> tuple[CellModel, Any]:
-    with LockstepCell(fake_cell(static=static), cell_dir=directory, runtime_dir=directory) as cell:
-        cell.run_for(0.5)
-        operator = LockstepOperator(cell)
-        operator.enable()
-        model = operator.calibrate()
-        operator.goal(JointTarget(dict(zip(NAMES, GOAL.tolist(), strict=True))))
-        cell.run_for(0.3)
-        operator.teach("shown")
-        return model, operator.taught["shown"]
 
 
 @dataclass

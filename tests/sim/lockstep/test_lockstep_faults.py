@@ -34,46 +34,16 @@ from stereoservo.daemon.seqlock import SlotReader, StopSlot, create_slot, create
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.daemon.vision import VisionSlots
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.cell_file import CellFile, check_cell
+from stereoservo.messages.cell_file import CellFile
 from stereoservo.messages.directories import CellDirectories
-from stereoservo.messages.goals import Disable, Enable, Goal, Jog, JointTarget, Request, Reset, RunGoal
+from stereoservo.messages.goals import Disable, Enable, Goal, Jog, Request, Reset, RunGoal
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, DriverError, JointState
 from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.world.history import TrueJointHistory
-from stereoservo_sim.world.simulated_cell import demo_cell
 
-NAMES = tuple(f"j{k}" for k in range(1, 7))
 CAMERAS = ("left", "right")
 BOUND_S = 1.5  # coast (0.5) + braking from full speed (0.25) + drives' time-out (0.1), generously
-GOAL = np.radians([4.0, -83.0, -29.0, -24.0, 53.0, -90.0])
-
-
-def fake_cell() -> CellFile:
-    base = demo_cell().base
-    return check_cell(
-        {
-            "schema": 1,
-            "cell": {"name": "faults"},
-            "joints": {"driver": "fake"},
-            "camera": [{"name": name, "driver": "fake"} for name in CAMERAS],
-            "servo": {"tolerance_px": 0.2, "hold_frames": 5},
-            "safety": {
-                "limit": [
-                    {"joint": n, "min": -m, "max": m, "velocity": 1.0, "acceleration": 4.0}
-                    for n, m in zip(NAMES, (2.7, 2.3, 2.4, 4.7, 1.8, 4.7), strict=True)
-                ]
-            },
-            "calibration": {
-                "base": dict(zip(NAMES, base.tolist(), strict=True)),
-                "range": dict(zip(NAMES, [0.3, 0.3, 0.3, 0.7, 0.6, 0.7], strict=True)),
-                "stops": 7,
-                "frames": 2,
-                "settle_s": 0.05,
-                "speed_scale": 1.0,
-            },
-        }
-    )
 
 
 class SocketLinks(ProcessLinks):
@@ -140,11 +110,11 @@ LINKS: dict[str, Callable[[Path], Any]] = {
 class Flight:
     """A cell on its way to a goal, and the truth about its arm."""
 
-    def __init__(self, directory: Path, links: LockstepLinks, model: CellModel, target: Any) -> None:
+    def __init__(self, directory: Path, links: LockstepLinks, file: CellFile, model: CellModel, target: Any) -> None:
         self.links: Any = links
         self.history = TrueJointHistory.in_memory(6, capacity=1 << 14)
         self.cell = LockstepCell(
-            fake_cell(),
+            file,
             cell_dir=directory,
             runtime_dir=directory,
             services={"world": self.history},
@@ -205,25 +175,12 @@ class Flight:
         ]
 
 
-@pytest.fixture(scope="module")
-def calibrated(tmp_path_factory: pytest.TempPathFactory) -> tuple[CellModel, Any]:
-    """A model of the fake cell and a goal that was shown to it."""
-    directory = tmp_path_factory.mktemp("calibrated")
-    with LockstepCell(fake_cell(), cell_dir=directory, runtime_dir=directory) as cell:
-        cell.run_for(0.5)
-        operator = LockstepOperator(cell)
-        operator.enable()
-        model = operator.calibrate()
-        operator.goal(JointTarget(dict(zip(NAMES, GOAL.tolist(), strict=True))))
-        cell.run_for(0.3)
-        operator.teach("shown")
-        return model, operator.taught["shown"]
-
-
 @pytest.fixture(params=LINKS)
-def flight(request: pytest.FixtureRequest, calibrated: tuple[CellModel, Any], tmp_path: Path) -> Iterator[Flight]:
+def flight(
+    request: pytest.FixtureRequest, fake_file: CellFile, calibrated: tuple[CellModel, Any], tmp_path: Path
+) -> Iterator[Flight]:
     """A cell on its way to the goal, on each kind of links."""
-    flight = Flight(tmp_path, LINKS[request.param](tmp_path), *calibrated)
+    flight = Flight(tmp_path, LINKS[request.param](tmp_path), fake_file, *calibrated)
     yield flight
     flight.cell.close()
 
