@@ -31,10 +31,12 @@ LINE = 0.5, 0.95
 """Fractions of a leg's time at which it is on its line: it begins before the one before has ended."""
 STRAIGHT = 1e-3
 """Largest deviation of a joint from a leg's line, as a fraction of half the leg, in a frame that is used."""
-ROUNDS = 6
+ROUNDS = 12
 LONGEST_DELAY_S = 0.3
 CONVERGED_S = 1e-6
-FALSE_ALARM = 1e-4
+PLAY_TERMS = 3
+"""Number of polynomial terms of the displacement by direction."""
+FALSE_ALARM = 1e-3
 """Probability of finding play in joints that have none."""
 STILL, MOST_OTHERS = 1e-6, 3
 """Motion of other joints [rad or m, rms] that is taken into account, and most directions of it."""
@@ -163,7 +165,7 @@ class _Track(NamedTuple):
 def _columns(along: FloatArray, low: float, high: float, count: int) -> FloatArray:
     """Chebyshev polynomials (k, count) over [low, high]."""
     scaled = 2.0 * (along - low) / max(high - low, 1e-12) - 1.0
-    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, count - 1), dtype=np.float64)
+    return np.asarray(np.polynomial.chebyshev.chebvander(scaled, max(count - 1, 0))[:, :count], dtype=np.float64)
 
 
 def _terms(along: FloatArray, pixels: FloatArray, seen: BoolArray) -> int:
@@ -214,8 +216,10 @@ def stamp_delays(legs: list[Leg], cameras: int) -> tuple[FloatArray, FloatArray]
     and its standard deviation (c,); 0 and infinite where these do not determine it.
     """
     pairs = [[leg for leg in legs if leg.trial == joint] for joint in sorted({leg.trial for leg in legs} - {-1})]
-    found = [_stamp_delay(pairs, camera) for camera in range(cameras)]
-    return np.array([delay for delay, _ in found]), np.array([deviation for _, deviation in found])
+    exact = [_fitted_delay(pairs, camera, 0.0, play=False) for camera in range(cameras)]
+    play = [_fitted_delay(pairs, camera, one.delay, play=True) for camera, one in enumerate(exact)]
+    chosen = play if _plays(exact, play) else exact
+    return np.array([one.delay for one in chosen]), np.array([one.deviation for one in chosen])
 
 
 class _Delay(NamedTuple):
@@ -227,21 +231,21 @@ class _Delay(NamedTuple):
     freedom: float
 
 
-def _stamp_delay(pairs: list[list[Leg]], camera: int) -> tuple[float, float]:
-    """Delay of a camera and its deviation: with joints that have play only if that explains the tracks better, because
-    play and delay are similar where the speed is constant.
+def _plays(exact: list[_Delay], play: list[_Delay]) -> bool:
+    """Whether joints with play explain the tracks of all cameras better than exact ones: play and delay are similar
+    where the speed is constant.
     """
-    exact, play = (_fitted_delay(pairs, camera, play=play) for play in (False, True))
-    more = exact.freedom - play.freedom
-    if not np.isfinite(exact.deviation) or play.freedom <= 0.0 or more <= 0.0:
-        return exact.delay, exact.deviation
-    ratio = (exact.squares - play.squares) / more / max(play.squares / play.freedom, 1e-300)
-    chosen = play if ratio > float(f_distribution.isf(FALSE_ALARM, more, play.freedom)) else exact
-    return chosen.delay, chosen.deviation
+    both = [(one, other) for one, other in zip(exact, play, strict=True) if np.isfinite(other.deviation)]
+    more = sum(one.freedom - other.freedom for one, other in both)
+    if more <= 0.0:
+        return False
+    left, freedom = sum(other.squares for _, other in both), sum(other.freedom for _, other in both)
+    ratio = (sum(one.squares for one, _ in both) - left) / more / max(left / freedom, 1e-300)
+    return bool(ratio > float(f_distribution.isf(FALSE_ALARM, more, freedom)))
 
 
-def _fitted_delay(pairs: list[list[Leg]], camera: int, *, play: bool) -> _Delay:
-    found = _Delay(0.0, np.inf, 0.0, 0.0)
+def _fitted_delay(pairs: list[list[Leg]], camera: int, start: float, *, play: bool) -> _Delay:
+    found = _Delay(start, np.inf, 0.0, 0.0)
     for _ in range(ROUNDS):
         equations = [_delay_equation(legs, camera, found.delay, play=play) for legs in pairs]
         across, square, squares, freedom = (sum(one[k] for one in equations) for k in range(4))
@@ -282,9 +286,8 @@ def _delay_equation(legs: list[Leg], camera: int, delay: float, *, play: bool) -
         if mask.sum() < FEWEST_FRAMES:
             continue
         mine = (seen == mask[:, None]).all(axis=0)
-        columns = np.column_stack(
-            [_columns(shown[mask], low, high, count), aside[mask], *((ahead[mask],) if play else ())]
-        )
+        displaced = ahead[mask, None] * _columns(shown[mask], low, high, PLAY_TERMS if play else 0)
+        columns = np.column_stack([_columns(shown[mask], low, high, count), aside[mask], displaced])
         slopes = np.polynomial.chebyshev.chebder(np.eye(count)) if count > 1 else np.zeros((0, count))
         basis, _ = np.linalg.qr(columns)
         tracks = pixels[mask][:, mine].reshape(int(mask.sum()), -1)

@@ -75,7 +75,8 @@ class TrialCollector:
         cameras = settings.cameras
         column = {marker: k for k, marker in enumerate(settings.marker_ids)}
         row = {camera.name: c for c, camera in enumerate(cameras)}
-        factors = [self._noise_factor(camera, means) for camera in cameras]
+        factors = [self._factor_at_stops(camera) for camera in cameras]
+        in_motion = np.array([_factor_in_motion(means, c) for c in range(len(cameras))])[:, None, None]
         shape = (len(cameras), len(self._stops), len(column))
         pixels, sigmas = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
         images = sum(int(of_leg.frames.sum()) for _, of_leg in means)
@@ -90,11 +91,10 @@ class TrialCollector:
         positions = [np.array([_joints(event) for event in self._stops])]
         trials = [np.array([event.trial for event in self._stops], dtype=np.int64)]
         for leg, of_leg in means:
-            systematic = np.array([camera.systematic_px**2 for camera in cameras])[:, None, None]
-            noise = (of_leg.single - systematic) / np.maximum(of_leg.counts, 1.0)
-            of_cameras = np.array(factors)[:, None, None]
+            # A marker that moves meets the detector's systematic errors by turns: they are averaged, too.
+            noise = in_motion * of_leg.single / np.maximum(of_leg.counts, 1.0)
             pixels = np.concatenate([pixels, of_leg.pixels], axis=1)
-            sigmas = np.concatenate([sigmas, np.sqrt(of_cameras * noise + systematic)], axis=1)
+            sigmas = np.concatenate([sigmas, np.sqrt(noise)], axis=1)
             positions.append(of_leg.positions)
             trials.append(np.full(len(of_leg.positions), leg.trial, dtype=np.int64))
         ever = np.asarray(finite_rows(pixels).any(axis=(0, 1)))
@@ -186,33 +186,45 @@ class TrialCollector:
             )
         return legs
 
-    def _noise_factor(self, camera: CameraSettings, means: list[tuple[Leg, LegMeans]]) -> float:
-        """Variance of the pixels over the frames of a stop, relative to the detector's stated one: maximum likelihood
-        over all stops, the mean of the ratios by degrees of freedom.
-
-        A ratio of sums would be dominated by few markers of large variance: one of 0.16 px among thousands of 0.005 px
-        changes it by a sixth. Markers beyond MOST_NOISE are not used: their stated variance expresses doubt (touching
-        dots, a dot that does not fit its face), which does not appear as scatter. 1 if single frames were taken or the
-        detector states no noise.
-        """
+    def _factor_at_stops(self, camera: CameraSettings) -> float:
+        """Variance of a camera's pixels over the frames of a stop, relative to the detector's stated noise."""
         samples = [sample for event in self._stops for sample in event.samples if sample.camera == camera.name]
-        c = self._settings.cameras.index(camera)
-        of_legs = [_scatter(of_leg, c, camera.systematic_px**2) for _, of_leg in means]
-        if not samples and not of_legs:
+        if not samples:
             return 1.0
-        frame_counts = np.concatenate([*(sample.sights for sample in samples), *(one[0] for one in of_legs)])
-        scatter = np.concatenate([*(sample.scatter for sample in samples), *(one[1] for one in of_legs)])
-        variance = np.concatenate(
-            [*(0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples), *(one[2] for one in of_legs)]
-        )
+        counts = np.concatenate([sample.sights for sample in samples])
+        scatter = np.concatenate([sample.scatter for sample in samples])
+        variance = np.concatenate([0.5 * np.trace(s.covariances, axis1=1, axis2=2) for s in samples])
         noise = variance - camera.systematic_px**2
-        single = noise * frame_counts
-        known = (noise > LEAST_NOISE * variance) & (frame_counts > 1.0)
-        if not known.any():
-            return 1.0
-        known &= single <= MOST_NOISE * np.median(single[known])
-        factor = float(np.average(scatter[known] / single[known], weights=frame_counts[known] - 1.0))
-        return factor if factor > 0.0 else 1.0
+        noise[noise <= LEAST_NOISE * variance] = 0.0
+        return _noise_factor(counts - 1.0, scatter, noise * counts)
+
+
+def _factor_in_motion(means: list[tuple[Leg, LegMeans]], camera: int) -> float:
+    """Variance of a camera's pixels about their tracks, relative to the detector's stated variance."""
+    freedom, scatter, single = [], [], []
+    for _, of_leg in means:
+        known = of_leg.freedom[camera] > 0.0
+        freedom.append(of_leg.freedom[camera, known])
+        scatter.append(of_leg.scatter[camera, known])
+        single.append(np.nanmean(of_leg.single[camera][:, known], axis=0))
+    return _noise_factor(*(np.concatenate(values) if values else np.zeros(0) for values in (freedom, scatter, single)))
+
+
+def _noise_factor(freedom: FloatArray, scatter: FloatArray, single: FloatArray) -> float:
+    """Observed variances ``scatter`` (k,) with ``freedom`` (k,), relative to those of ``single`` (k,) observations:
+    maximum likelihood, the mean of the ratios by degrees of freedom.
+
+    A ratio of sums would be dominated by few markers of large variance: one of 0.16 px among thousands of 0.005 px
+    changes it by a sixth. Markers beyond MOST_NOISE are not used: their stated variance expresses doubt (touching
+    dots, a dot that does not fit its face), which does not appear as scatter. 1 if single frames were taken or the
+    detector states no noise.
+    """
+    known = (freedom > 0.0) & (single > 0.0)
+    if not known.any():
+        return 1.0
+    known &= single <= MOST_NOISE * np.median(single[known])
+    factor = float(np.average(scatter[known] / single[known], weights=freedom[known]))
+    return factor if factor > 0.0 else 1.0
 
 
 def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, LegMeans]]:
@@ -242,14 +254,6 @@ def _observations(
         pixels[f, at] = frame.pixels[known]
         variances[f, at] = 0.5 * np.trace(frame.covariances[known], axis1=1, axis2=2)
     return np.array([1e-9 * (frame.t_ns - start_ns) for frame in mine]), pixels, variances
-
-
-def _scatter(means: LegMeans, camera: int, systematic: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Of a camera's markers on a sweep: degrees of freedom plus one, scatter, and the variance of a mean of as many."""
-    known = means.freedom[camera] > 0.0
-    counts = means.freedom[camera, known] + 1.0
-    single = np.nanmean(means.single[camera][:, known], axis=0)
-    return counts, means.scatter[camera, known], (single - systematic) / counts + systematic
 
 
 def _joints(event: Event) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
