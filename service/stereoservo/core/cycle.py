@@ -113,19 +113,19 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
     scatter: FloatArray
 
 
-class PathFrame(msgspec.Struct, frozen=True, eq=False):
+class PathFrame(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     """A frame taken in motion: number of its ``camera`` in the cell, stated shutter time, markers' ``ids`` (k,), raw
-    ``pixels`` (k, 2) and their ``covariances`` (k, 2, 2).
+    ``pixels`` (k, 2), and of a sweep their ``covariances`` (k, 2, 2).
     """
 
     camera: int
     t_ns: int
     ids: IntArray
     pixels: FloatArray
-    covariances: FloatArray
+    covariances: FloatArray | None = None
 
 
-class PathRecord(msgspec.Struct, frozen=True, eq=False):
+class PathRecord(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     """Data recorded in motion: ``frames``, and joint samples ``positions`` (k, n) at ``joints_ns`` (k,). ``leg``:
     number of the sweep, 0 on the path to a stop.
     """
@@ -155,7 +155,7 @@ class Event(msgspec.Struct, frozen=True, eq=False):
     progress: float | None = None
     plan: PlanReport | None = None
     """Of a reply to a goal that was planned."""
-    path: PathRecord | None = None
+    path: PathRecord | None = msgspec.field(default=None, name="way")
     """Of a calibration's sweep, or of the path to its stop."""
     loads: JointLoads | None = None
     """Of finished trial motions, if the drives report loads."""

@@ -258,9 +258,9 @@ class TrialMotion(PoseMeasurement, eq=False, kw_only=True):
     sigma_px: float
     slope_sums: FloatArray
     slope_weights: FloatArray
-    path_frames: list[PathFrame] = []
-    path_ns: list[int] = []
-    path_joints: list[FloatArray] = []
+    path_frames: list[PathFrame] = msgspec.field(default_factory=list, name="way_frames")
+    path_ns: list[int] = msgspec.field(default_factory=list, name="way_ns")
+    path_joints: list[FloatArray] = msgspec.field(default_factory=list, name="way_joints")
 
 
 class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):

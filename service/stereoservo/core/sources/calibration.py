@@ -150,7 +150,6 @@ def _record_path(trials: CalibrationMotion, context: StepContext) -> None:
                     observation.t_shutter_ns,
                     np.asarray(observation.ids[chosen], dtype=np.int64),
                     np.array(observation.pixels[chosen]),
-                    np.array(observation.covariances[chosen]),
                 )
             )
     now_ns = context.state.block.numbers.last_joints_ns

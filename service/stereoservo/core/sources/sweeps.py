@@ -146,7 +146,7 @@ def _enough(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) 
     if joint == sweeps.lowest.size or sweeps.motion_sigmas[joint] < ENOUGH_SIGMAS:
         return False
     offset = abs(float(context.q[joint] - settings.base[joint]))
-    return offset >= ALONE * _range(joint, context, settings)
+    return offset >= max(ALONE * _range(joint, context, settings), 1.5 * settings.min_range)
 
 
 def _finish(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:

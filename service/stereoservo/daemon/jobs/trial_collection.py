@@ -252,7 +252,8 @@ def _observations(
         known = [k for k, marker in enumerate(frame.ids.tolist()) if marker in column]
         at = [column[int(frame.ids[k])] for k in known]
         pixels[f, at] = frame.pixels[known]
-        variances[f, at] = 0.5 * np.trace(frame.covariances[known], axis1=1, axis2=2)
+        if frame.covariances is not None:
+            variances[f, at] = 0.5 * np.trace(frame.covariances[known], axis1=1, axis2=2)
     return np.array([1e-9 * (frame.t_ns - start_ns) for frame in mine]), pixels, variances
 
 
