@@ -19,7 +19,7 @@ from scipy.stats import f as f_distribution
 from stereoservo.calibration.trial_data import finite_rows
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-FEWEST_TERMS, MOST_TERMS, MORE_TERMS = 3, 10, 2
+FEWEST_TERMS, MOST_TERMS, MORE_TERMS = 3, 24, 2
 """Range of the number of a track's polynomial terms that the data show, and how many more are used: what is left out
 would be an error that all markers share.
 """
