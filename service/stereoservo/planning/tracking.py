@@ -79,11 +79,11 @@ def interpolate_into(times: FloatArray, values: FloatArray, t_s: float, out: Flo
         return
     low, high = 0, K - 1
     while high - low > 1:
-        middle = (low + high) // 2
-        if times[middle] <= t_s:
-            low = middle
+        midpoint = (low + high) // 2
+        if times[midpoint] <= t_s:
+            low = midpoint
         else:
-            high = middle
+            high = midpoint
     h = times[high] - times[low]
     pace_low, pace_high = _pace_at(times, low), _pace_at(times, high)
     x = (t_s - times[low]) / h
