@@ -99,7 +99,7 @@ def test_bundle_with_joint_noise_is_generalised_least_squares():
     P = np.linalg.inv(V) - np.linalg.solve(V, X) @ np.linalg.solve(information, np.linalg.solve(V, X).T)
     assert solution.cost == pytest.approx(y @ P @ y, rel=1e-9)
     assert np.allclose(
-        solution.determined.triangle.T @ solution.determined.triangle,
+        solution.statistics.triangle.T @ solution.statistics.triangle,
         information,
         rtol=1e-6,
         atol=1e-9 * information.max(),

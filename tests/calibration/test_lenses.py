@@ -16,8 +16,8 @@ from stereoservo.calibration.lens_estimation import (
     epipolar_lenses,
     implausible_lens,
     lens_test,
-    lens_wanted,
     lenses_explain_more,
+    required_lens_model,
     straight_lenses,
     undistorted,
 )
@@ -310,7 +310,7 @@ def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likeli
     blamed = [scale.joint for scale in model_scales(solution) if scale.wrong]
     assert 2 in blamed or cause != "scale of a joint", model_scales(solution)
     assert lenses_explain_more(solution) == (cause == "second radial term")
-    assert lens_wanted(solution) == ("brown" if cause == "second radial term" else "radial_centre")
+    assert required_lens_model(solution) == ("brown" if cause == "second radial term" else "radial_centre")
 
 
 @pytest.mark.parametrize(

@@ -330,7 +330,7 @@ def test_what_cannot_be_re_anchored_is_refused_with_what_is_missing():
     wrong = np.radians(20.0) * np.eye(6)[2]
     drifted = sights(moved, cell.held_out(rng, 4, 0.5), rng)
     drifted = RestObservations(
-        tuple(RestPose(pose.joints + wrong * k, pose.sights) for k, pose in enumerate(drifted.poses))
+        tuple(RestPose(pose.joints + wrong * k, pose.samples) for k, pose in enumerate(drifted.poses))
     )
     unexplained = refusal(model, drifted, ("cam1",))
     assert unexplained.code == "not_explained"

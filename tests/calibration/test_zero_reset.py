@@ -24,7 +24,7 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagated
 from stereoservo.kinematics.joint_angles import joint_zeros
-from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+from stereoservo.kinematics.joint_reprojection import observed_chain, predicted_pixels
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.check_report import ZeroReset
 from stereoservo_sim.world.synthetic import SyntheticCell, pan_tilt, rx90
@@ -55,7 +55,7 @@ def calibrated(exact: CellModel, rng: np.random.Generator) -> CellModel:
 
 def seen(exact: CellModel, stops: np.ndarray, drift: np.ndarray, rng: np.random.Generator) -> TrialData:
     """A check of the cell that ``exact`` is the truth about, its encoders off by ``drift``."""
-    pixels = np.moveaxis(predicted_pixels(seen_chain(exact), stops + drift, exact.marker_points), 1, 0)
+    pixels = np.moveaxis(predicted_pixels(observed_chain(exact), stops + drift, exact.marker_points), 1, 0)
     cell = pan_tilt() if exact.tip_first else rx90()
     frame = cell.trials(SIGMA, rng, positions=(stops, np.full(len(stops), -1)))
     return msgspec.structs.replace(
@@ -88,8 +88,8 @@ def test_one_drifted_zero_is_cured_to_the_noise_floor(tmp_path: Path) -> None:
     assert again.status == "holds", again.message
     # Predictions elsewhere, without noise: what is left is the drift's deviation.
     q = cell.held_out(rng, 20)
-    exact = predicted_pixels(seen_chain(model), q + drift, model.marker_points)
-    left = predicted_pixels(seen_chain(cured), q, cured.marker_points) - exact
+    exact = predicted_pixels(observed_chain(model), q + drift, model.marker_points)
+    left = predicted_pixels(observed_chain(cured), q, cured.marker_points) - exact
     assert np.sqrt(np.mean(left**2)) < SIGMA / 2
     save_model(cured, tmp_path / "m.json")
     assert np.array_equal(load_model(tmp_path / "m.json").zero, cured.zero)
@@ -107,7 +107,7 @@ def test_the_zeros_of_all_joints_lost_by_far_are_found_from_nothing() -> None:
     assert told.sigmas_after < 1.3
     # The other program for it takes the model for exact: it must agree within what the model leaves open.
     images = np.moveaxis(data.pixels, 0, 1)
-    alone = joint_zeros(seen_chain(model), model.marker_points, images[:2], SIGMA, data.positions[:2])
+    alone = joint_zeros(observed_chain(model), model.marker_points, images[:2], SIGMA, data.positions[:2])
     assert np.abs(alone.offset - [joint.drift for joint in told.joints]).max() < 3e-3
 
 
@@ -144,7 +144,7 @@ def test_drifts_and_predictions_have_their_stated_covariance(make: Callable[[], 
         q = cell.home[None] + rng.uniform(-0.5, 0.5, (1, n)) * np.asarray(cell.ranges)
 
         def pixel(one: CellModel, q: np.ndarray = q) -> np.ndarray:
-            return predicted_pixels(seen_chain(one), q, one.marker_points[:1])[0, 0, 0]
+            return predicted_pixels(observed_chain(one), q, one.marker_points[:1])[0, 0, 0]
 
         found, covariance = propagated(cured, pixel)
         error = found - pixel(exact, q + drift)

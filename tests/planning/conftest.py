@@ -48,7 +48,7 @@ def plan_request(world, T_star, limits=None, centre=(0.0, 0.0, 0.0, 1.0), **opti
         "camera_centres": world.camera_centres,
         "points": world.hidden(world.markers()),
         "targets": world.hidden(_cells.PLATE @ T_star.T),
-        "kept": np.ones(4),
+        "must_stay_visible": np.ones(4),
         "centre": world.hidden(world.plate_pose() @ np.array(centre)),
         "centre_target": world.hidden(T_star @ np.array(centre)),
         "faces": np.array([[0, 1, 2]]),

@@ -200,8 +200,8 @@ def _joint_errors(report: CalibrationReport) -> str:
             if value > SEEN * deviation
         ]
         both = float(np.linalg.norm([joint.repeatable, joint.random, joint.posture]))
-        told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
-        parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
+        text = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
+        parts.append(f"joint {joint.name} {text} ({joint.pixels:.2g} px)")
     have = "may have" if report.exact_joints_chance else "have"
     return f"Joint readings {have} errors, as standard deviations: {'; '.join(parts)}"
 
@@ -255,8 +255,8 @@ def _identified(
         why = [note for note in report.notes if "refused" in note]
         if why:
             # The last attempt at the required stratum is nearest to the truth.
-            wanted = why[0].split()[0]
-            reasons.append([note for note in why if note.startswith(wanted)][-1])
+            missing = why[0].split()[0]
+            reasons.append([note for note in why if note.startswith(missing)][-1])
     if not loose and model.stratum == "metric":
         return
     short = False

@@ -20,11 +20,11 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
 from stereoservo.calibration.joint_noise import orthogonal_factor
-from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_slopes
+from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_jacobian
 from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, predicted, residuals
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
-from stereoservo.geometry.distortion import LensEstimate, straight_lens, terms_jacobian, undistort
+from stereoservo.geometry.distortion import LensEstimate, pinhole_lens, terms_jacobian, undistort
 from stereoservo.geometry.fundamental import INLIER_SIGMAS, fundamental_robust, sampson_distances
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import pinhole
@@ -88,12 +88,12 @@ def lens_test(solution: Solution) -> LensTest:
 def terms_test(solution: Solution) -> LensTest:
     """Chi-square, to first order, of the second radial and both tangential terms of all lenses that lack them."""
     gain, terms = _gain(solution, _distortion_columns(solution))
-    freedom = max(1, solution.determined.freedom - terms)
+    freedom = max(1, solution.statistics.freedom - terms)
     factor = max(1.0, (solution.cost - gain) / freedom)
     return LensTest(gain / factor, terms, float(chi2_distribution.isf(LENS_TAIL, terms)))
 
 
-def lens_wanted(solution: Solution) -> LensModel:
+def required_lens_model(solution: Solution) -> LensModel:
     """The lens model that the bundle's residuals require: its own, or a richer one.
 
     Terms that a lens lacks are compared with scale factors of the joints, which they imitate: the hypothesis of
@@ -123,7 +123,7 @@ def _evidence(solution: Solution) -> tuple[float, float]:
     found = []
     for columns in (_distortion_columns(solution), scale_columns(solution, joints)):
         gain, count = _gain(solution, columns)
-        found.append(gain / max(1.0, solution.determined.variance) - count * float(np.log(solution.rows)))
+        found.append(gain / max(1.0, solution.statistics.variance) - count * float(np.log(solution.rows)))
     return found[0], found[1]
 
 
@@ -287,7 +287,7 @@ MOST_MATCHES = 20_000
 
 def straight_lenses(trials: TrialData) -> FloatArray:
     """Lenses (c, 4) without distortion for the cameras of the trials."""
-    return np.array([straight_lens(camera.width, camera.height) for camera in trials.cameras])
+    return np.array([pinhole_lens(camera.width, camera.height) for camera in trials.cameras])
 
 
 def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
@@ -462,7 +462,7 @@ def _refined(
     def step(z: FloatArray, x: FloatArray) -> FloatArray:
         return np.clip(z + x, -limit, limit)
 
-    slopes = numeric_slopes(errors, np.add, len(limit), 1e-7)
+    slopes = numeric_jacobian(errors, np.add, len(limit), 1e-7)
     z, cost = np.zeros(len(limit)), np.inf
     for scale in (3.0 * bound, 3.0):
         fit = DenseFit(

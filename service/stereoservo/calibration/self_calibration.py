@@ -33,7 +33,7 @@ from stereoservo.calibration.diagnosis.input_corrections import Refit
 from stereoservo.calibration.diagnosis.joint_scales import (
     ScalesError,
     explains,
-    one_thing_happened,
+    is_single_event,
     refuse_wrong_scales,
     scales_error,
     small_scales,
@@ -48,9 +48,9 @@ from stereoservo.calibration.lens_estimation import (
     FULL_LENS,
     STARTING_BENDS,
     implausible_lens,
-    lens_wanted,
     lenses_may_bend,
     prior_of_lenses,
+    required_lens_model,
     starting_lenses,
     undistorted,
 )
@@ -372,7 +372,7 @@ def _fit(
                 refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
-            elif chi2_within(bundles.final.cost, bundles.final.determined.freedom):
+            elif chi2_within(bundles.final.cost, bundles.final.statistics.freedom):
                 components, chance = likely_errors(rows)
     report_progress("report", 0.95)
     result = build_fit(
@@ -382,7 +382,7 @@ def _fit(
         bundles.inliers,
         ModelFrame(start.zero, bundles.raised.plane),
         FitHistory(
-            (bundles.projective.cost, bundles.projective.determined.freedom),
+            (bundles.projective.cost, bundles.projective.statistics.freedom),
             bundles.raised.notes,
             start.markers_left_out,
         ),
@@ -454,7 +454,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = _settled(raised.solution, every, options)
     for _ in range(2 if options.lens == "auto" else 0):
-        wanted = lens_wanted(final)
+        wanted = required_lens_model(final)
         if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
             wanted = FREE_LENS if final.lenses == "none" else FULL_LENS
         if wanted == final.lenses:
@@ -491,7 +491,7 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
-    if chi2_within(free.cost, free.determined.freedom):
+    if chi2_within(free.cost, free.statistics.freedom):
         return None
     # Wrong pixels would count as joint errors; those of a whole stop would not be detected.
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
@@ -563,13 +563,13 @@ def _refined_by_joint_errors(
         )
         before = components
         components = estimate_components(reduced_rows(final, at), scales=False, near=before)
-        if components is not None and components.like(before):
+        if components is not None and components.is_close_to(before):
             components = before
             break
     if components is None or not explains(start.trials, final, inliers, components):
         return None
     refuse_undetermined(final, bundles.raised.notes)
-    doubtful = one_thing_happened(start.trials, final)
+    doubtful = is_single_event(start.trials, final)
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
 

@@ -131,7 +131,7 @@ class VarianceComponents:
         variance = np.maximum(np.diag(self.covariance)[2 * n :], 0.0)
         return np.where(self.posture > 0.0, _stated(self.posture, variance), 0.0)
 
-    def like(self, other: VarianceComponents) -> bool:
+    def is_close_to(self, other: VarianceComponents) -> bool:
         """Whether the joints' errors equal those of another estimate, to a tenth of their standard deviations."""
         off = np.concatenate(
             [self.random - other.random, self.repeatable - other.repeatable, self.posture - other.posture]
@@ -316,9 +316,9 @@ class _Likelihood:
         matrix = variances[0] * reduced.pixels
         for joint in np.flatnonzero(variances[1:].reshape(3, n).any(axis=0)):
             slopes = reduced.slopes[first:, joint]
-            places, courses = reduced.shared(int(joint))
+            places, features = reduced.shared(int(joint))
             own, repeatable, posture = variances[1 + joint :: n]
-            errors = repeatable * places @ places.T + posture * courses @ courses.T
+            errors = repeatable * places @ places.T + posture * features @ features.T
             errors[np.diag_indices(len(errors))] += own
             errors = np.repeat(np.repeat(errors, counts, axis=0), counts, axis=1)
             matrix[first:, first:] += slopes[:, None] * slopes * errors

@@ -132,7 +132,7 @@ class _Lines:
         flat: FloatArray = (whitening @ away).ravel()
         return flat
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
         """Derivatives (2 c m, k) of the residuals by x in ``exp(Σ x Ĝ) T`` at x = 0."""
         moved, J = self._moved(T)
         by_map = np.nan_to_num(np.einsum("cmkj,gji,mki->mckg", J, generators, moved))
@@ -172,7 +172,7 @@ class _Planes:
         away: FloatArray = (self._moved(T)[0] * self.b).sum(axis=1) * whitening
         return away
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
         """Derivatives (p, k) of the residuals by the map's parameters."""
         moved, _ = self._moved(T)
         steps = np.einsum("gij,pj->pgi", generators, moved)
@@ -195,8 +195,8 @@ class _Mixed:
             raise np.linalg.LinAlgError("the map has diverged")
         return np.concatenate([part.residuals(T, w) for part, w in zip(self.parts, whitening, strict=True)])
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
-        return np.concatenate([part.slopes(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)])
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
+        return np.concatenate([part.jacobian(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)])
 
 
 def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -296,7 +296,7 @@ def align_incidences(
                 "degenerate",
                 "two maps bring the features onto their images alike; add a line or a point that tells them apart",
             )
-    J = mixed.slopes(T, generators, mixed.whitening(T))
+    J = mixed.jacobian(T, generators, mixed.whitening(T))
     _, singular, rows = np.linalg.svd(J, full_matrices=False)
     k = len(generators)
     if len(singular) < k or not singular[k - 1] > 1e-8 * singular[0]:
@@ -306,10 +306,10 @@ def align_incidences(
     freedom = count - k
     rms = float(np.sqrt(squares / freedom)) if freedom > 0 else 0.0
     change = FrameChange(T, chart @ chart.T, tuple(range(then.points.shape[1])), rms, freedom)
-    return change, *_left(mixed, T)
+    return change, *_fit_residuals(mixed, T)
 
 
-def _left(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fit_residuals(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals of the map ``T`` (4, 4): rms distances of points [px], and largest distances of lines, relative to
     their uncertainty beside the current noise [px]: a line that lay nearly in an epipolar plane then counts little.
     """
@@ -494,9 +494,9 @@ def _shift(
         for direction in np.linalg.svd(b[1:] - b[0])[2][: len(incidence.second) - 1] if len(b) > 1 else ():
             across = across - np.outer(direction, direction)
         for x in a:
-            turned = R @ x
-            rows.append(across @ np.column_stack([turned if scaled else np.zeros(3), np.eye(3)]))
-            rhs.append(across @ (b[0] if scaled else b[0] - turned))
+            rotated = R @ x
+            rows.append(across @ np.column_stack([rotated if scaled else np.zeros(3), np.eye(3)]))
+            rhs.append(across @ (b[0] if scaled else b[0] - rotated))
     A, y = np.concatenate(rows), np.concatenate(rhs)
     if not scaled:
         A = A[:, 1:]

@@ -53,7 +53,7 @@ PARALLEL = np.radians(5.0)
 """Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
 """Distance between axes, as a fraction of the arm's size, below which they count as intersecting."""
-DH_HEAD = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
+DH_HEADER = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
 ROUNDING = 1e-9
 """Standard deviations below this fraction of the value are rounding: the value is the known length itself."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
@@ -132,7 +132,7 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
 
 
 def dh_cells(row: DhRow) -> tuple[str, ...]:
-    """A row as text below `DH_HEAD`: values with their standard deviations, those set by a convention in brackets."""
+    """A row as text below `DH_HEADER`: values with their standard deviations, those set by a convention in brackets."""
     cells = [row.joint]
     for column in COLUMNS:
         factor = 1e3 if column in ("a", "d") else float(np.degrees(1.0))

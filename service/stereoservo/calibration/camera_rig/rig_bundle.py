@@ -41,7 +41,7 @@ from stereoservo.calibration.rig_model import (
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.displacements import similarity_from_points
-from stereoservo.geometry.distortion import lens_from_lines, straight_lens, undistort
+from stereoservo.geometry.distortion import lens_from_lines, pinhole_lens, undistort
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.homography import homography_from_points, plane_homography
 from stereoservo.geometry.screws import twist_matrix
@@ -150,10 +150,10 @@ def _line_lens(views: RigViews, k: int) -> FloatArray:
         try:
             found = lens_from_lines(lines, sigma, camera.width, camera.height).lens
             # Lines hardly determine the centre of a weak distortion, and the principal point is tied to it.
-            return np.append(found[0], straight_lens(camera.width, camera.height)[1:])
+            return np.append(found[0], pinhole_lens(camera.width, camera.height)[1:])
         except GeometryError:
             pass  # the bundle converges from a lens without distortion, too
-    return straight_lens(camera.width, camera.height)
+    return pinhole_lens(camera.width, camera.height)
 
 
 def _layout_lines(layout: FloatArray | None) -> list[list[int]]:
@@ -238,7 +238,7 @@ def _starts_of_body(views: RigViews) -> list[RigStart]:
     found, failure = [], None
     for lenses in (
         epipolar_lenses(trials),
-        np.array([straight_lens(c.width, c.height) for c in views.cameras]),
+        np.array([pinhole_lens(c.width, c.height) for c in views.cameras]),
     ):
         try:
             found += _starts_through(views, trials, lenses)
@@ -435,9 +435,9 @@ class RigFit(RigProblem):
     @cached_property
     def root(self) -> FloatArray:
         """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance of the residuals."""
-        return np.asarray(self.solution.determined.root * np.sqrt(self.variance))
+        return np.asarray(self.solution.statistics.root * np.sqrt(self.variance))
 
-    def moved(self, x: FloatArray) -> RigModel:
+    def retract(self, x: FloatArray) -> RigModel:
         """The model at chart coordinates ``x`` (p,)."""
         return rig_at(self.rig, self.solution.charts, x)
 
@@ -463,22 +463,22 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     rig = _rig(start, body_frame)
     known = start.reference is None
     if known:
-        data = _with_poses_settled(rig, data)
+        data = _with_refined_poses(rig, data)
     begun = RigProblem(views, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, known)
     if not known:
         ties = PinholeTies(LOOSE, LOOSE, LOOSE)
-        loose = _settled(begun, rig, lenses, ties)
+        loose = _converged(begun, rig, lenses, ties)
         if not loose.solution.converged:  # its first step is too large for the initial places
-            begun = replace(begun, data=_with_poses_settled(rig, data))
-            loose = _settled(begun, rig, lenses, ties)
+            begun = replace(begun, data=_with_refined_poses(rig, data))
+            loose = _converged(begun, rig, lenses, ties)
         if not loose.solution.converged:
             return loose
         begun, rig = loose, loose.rig
-    square = _settled(begun, rig, lenses, PinholeTies(TIED, TIED, TIED))
+    square = _converged(begun, rig, lenses, PinholeTies(TIED, TIED, TIED))
     if not square.solution.converged:
         return square
     open_aspect = PinholeTies(TIED, np.inf, TIED)
-    free = _settled(square, square.rig, lenses, open_aspect)
+    free = _converged(square, square.rig, lenses, open_aspect)
     if not free.solution.converged:
         return free
     # Pixels are square unless the chi-square of all cameras' aspects is far beyond chance.
@@ -487,7 +487,7 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
         return square
     for _ in range(ASPECT_ROUNDS):
         ratio = np.mean([np.divide(*np.diag(decompose_camera(P)[0])[:2]) for P in free.rig.cameras])
-        free = _settled(*_stretched(free, float(ratio)), lenses, open_aspect)
+        free = _converged(*_stretched(free, float(ratio)), lenses, open_aspect)
         if not free.solution.converged:
             break
     return free
@@ -511,7 +511,7 @@ def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
     )
 
 
-def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
+def _converged(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
     """The bundle from ``rig``, starting with the places and the kept measurements of ``begun``."""
     data, kept = replace(begun.data, pinhole_ties=ties), begun.kept
     for _ in range(ROUNDS):
@@ -536,18 +536,18 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
     return fit
 
 
-def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
+def _with_refined_poses(rig: RigModel, data: Measurements) -> Measurements:
     """The measurements with the hand's readings fitted to each stop separately, with cameras and body fixed, because
     the bundle does not damp the hand's errors.
     """
     offsets = data.offsets.copy()
     for stop in np.unique(data.stop):
         mine = data.select(data.stop == stop)
-        offsets[stop] = _settled_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
+        offsets[stop] = _refined_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
     return replace(data, offsets=offsets)
 
 
-def _settled_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
+def _refined_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
     fit = DenseFit[FloatArray](
         lambda q: residuals(rig, replace(data, offsets=q[None]))[:, None],
         lambda q: joint_columns(rig, replace(data, offsets=q[None]))[:, None],

@@ -23,7 +23,7 @@ from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.strata import decompose_camera, intrinsics_and_slopes
+from stereoservo.geometry.strata import decompose_camera, intrinsics_and_jacobian
 from stereoservo.numerics.arrays import FloatArray
 
 SCHEMA = 1
@@ -306,7 +306,7 @@ def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
     here = _physical(fit.rig, fit.aspect, known, ids, metric)
 
     def vector(x: FloatArray) -> FloatArray:
-        there = _physical(fit.moved(x), fit.aspect, known, ids, metric)
+        there = _physical(fit.retract(x), fit.aspect, known, ids, metric)
         turns = Rotation.from_matrix(there.rotations @ here.rotations.transpose(0, 2, 1)).as_rotvec()
         return np.concatenate([there.intrinsics.ravel(), np.hstack([turns, there.translations])[1:].ravel()])
 
@@ -416,7 +416,7 @@ def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
     """
     worst = max(result.cameras, key=lambda camera: camera.deviations["fx"] / camera.focal[0])
     k = [camera.name for camera in result.cameras].index(worst.name)
-    known, scale = fit.solution.determined.triangle, float(np.sqrt(fit.variance))
+    known, scale = fit.solution.statistics.triangle, float(np.sqrt(fit.variance))
     row = _focal_slope(fit, k)
     now = scale * deviation_of(known, row)
     found = []
@@ -444,7 +444,7 @@ def _focal_slope(fit: RigFit, k: int) -> FloatArray:
     charts = fit.solution.charts
     row = np.zeros(charts.size)
     at = charts.start(1) + sum(len(basis) for basis in charts.cameras[:k])
-    row[at : at + len(charts.cameras[k])] = intrinsics_and_slopes(fit.rig.cameras[k], charts.cameras[k])[1][0]
+    row[at : at + len(charts.cameras[k])] = intrinsics_and_jacobian(fit.rig.cameras[k], charts.cameras[k])[1][0]
     return row
 
 

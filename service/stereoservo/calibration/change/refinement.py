@@ -187,11 +187,11 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     values, vectors = np.linalg.eigh(rows.T @ rows)
     values = np.maximum(values, 0.0)
     covariance = (axes @ vectors / (1.0 + values)) @ (axes @ vectors).T
-    told = values > LEAST_KNOWLEDGE
-    steps = (vectors.T @ z)[told]
+    observable = values > LEAST_KNOWLEDGE
+    steps = (vectors.T @ z)[observable]
     # Under a valid prior the estimate has the covariance M (I + M)⁻¹.
-    chi2 = float((steps**2 * (1.0 + values[told]) / values[told]).sum())
-    limit = float(chi2_distribution.isf(CHANCE, max(1, int(told.sum()))))
+    chi2 = float((steps**2 * (1.0 + values[observable]) / values[observable]).sum())
+    limit = float(chi2_distribution.isf(CHANCE, max(1, int(observable.sum()))))
     return RefinementStep(axes @ z, 0.5 * (covariance + covariance.T), chi2, limit)
 
 
@@ -213,9 +213,9 @@ def _cross_validated(
     gain = size = before = after = 0.0
     errors: list[tuple[FloatArray, FloatArray]] = []
     for fold in range(FOLDS):
-        apart = data.stop % FOLDS == fold
-        held = data.select(apart)
-        found = displaced_model(base, estimate_step(base, data.select(~apart)).x)
+        held_out = data.stop % FOLDS == fold
+        held = data.select(held_out)
+        found = displaced_model(base, estimate_step(base, data.select(~held_out)).x)
         old, new = (_seen(model, held, samples) for model in (used, found))
         B = bounded(joint_uncertainty(base, held, acting_order(base)))
         change = new - old

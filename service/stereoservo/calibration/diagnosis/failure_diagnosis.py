@@ -256,8 +256,10 @@ def untested(trials: TrialData) -> tuple[str, ...]:
     only move one at a time, from one configuration.
     """
     n = len(trials.joint_names)
-    apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(trials.positions, axis=0)
-    together = int(((trials.trials < 0) & (apart.sum(axis=1) > 1)).sum())
+    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
+        trials.positions, axis=0
+    )
+    together = int(((trials.trials < 0) & (displaced.sum(axis=1) > 1)).sum())
     bases = [np.median(trials.positions[trials.trials == j], axis=0) for j in range(n) if (trials.trials == j).any()]
     moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > MOVED
     if n < 2 or together >= LEAST_TOGETHER or moved:

@@ -84,9 +84,9 @@ def exchanged_ids(trials: TrialData, k: int) -> tuple[int, int] | None:
         return None
     best, least = None, AGREES
     for a, b in combinations(range(m), 2):
-        mended = with_ids_exchanged(trials, k, a, b)
-        F = robust_fundamental(mended, k)
-        share = 0.0 if F is None else float(np.nanmean(_marker_shares(mended, F, k)))
+        corrected = with_ids_exchanged(trials, k, a, b)
+        F = robust_fundamental(corrected, k)
+        share = 0.0 if F is None else float(np.nanmean(_marker_shares(corrected, F, k)))
         if share >= least:
             best, least = (a, b), share
     return best

@@ -121,7 +121,7 @@ class RecordedViews:
         return replace(self, times=times, added=added).select(np.argsort(times, kind="stable"))
 
 
-def frames_apart(views: RecordedViews) -> TrialData:
+def frames_as_stops(views: RecordedViews) -> TrialData:
     """Trial data with every frame as a separate stop, at its own stamp."""
     f, m = views.sigmas.shape
     shape = (len(views.cameras), f, m)
@@ -207,12 +207,12 @@ def instants(views: RecordedViews) -> IntArray:
         began |= still & np.concatenate([[False], jumped])
         rests = np.where(still, np.cumsum(began) - 1, -1)
         if int(rests.max(initial=-1)) + 1 >= LEAST_RESTS:
-            return _standing(rests, views)
+            return _static_frames(rests, views)
     apart = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
     return np.asarray(np.cumsum(apart))
 
 
-def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
+def _static_frames(rests: IntArray, views: RecordedViews) -> IntArray:
     """Rests (f,) without the frames whose markers differ from those nearest to the middle of the rest, by
     camera: with wrong stamps, the first or the last ones show motion.
     """
@@ -421,7 +421,7 @@ def partly_changed(problem: ExaminedFrames, changed: BoolArray) -> PartlyChanged
 def examined_frames(model: CellModel, views: RecordedViews, noise_factor: float) -> ExaminedFrames:
     """The problem of all frames; ``noise_factor`` >= 1 multiplies every sigma. Raises CalibrationError."""
     exact = msgspec.structs.replace(model, joint_accuracy=None)
-    plain = linearised_problem(exact, frames_apart(views), None, noise_factor)
+    plain = linearised_problem(exact, frames_as_stops(views), None, noise_factor)
     order = np.argsort(plain.data.stop, kind="stable")
     data = plain.data.select(order)
     root = unbounded(plain.uncertainty)[(2 * order[:, None] + np.arange(2)).ravel()]

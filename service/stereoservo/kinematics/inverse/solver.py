@@ -19,9 +19,9 @@ from stereoservo.kinematics.inverse.closed_forms import (
     Branches,
     arm,
     arm_with_wrist,
+    concatenate,
     gantry_with_wrist,
     prismatic_joints,
-    together,
     turn_between,
     two_general,
     two_parallel,
@@ -197,7 +197,7 @@ def _candidates(
         return turn_between(G[0], points, targets, float(seed[0]))
     if case in SINGLE_POINT:
         pairs = zip(points[:WITNESSES], targets[:WITNESSES], strict=True)
-        return together([SINGLE_POINT[case](G, A, goal, seed) for A, goal in pairs])
+        return concatenate([SINGLE_POINT[case](G, A, goal, seed) for A, goal in pairs])
     if case in WHOLE_ROTATION and H is not None:
         return WHOLE_ROTATION[case](G, H, seed)
     return None
@@ -237,9 +237,9 @@ def _rank(problem: _Problem) -> int:
 
 def _representatives(problem: _Problem, ends: FloatArray) -> FloatArray:
     """Point of a continuum (s, n) nearest to the seed; with limits, the first few."""
-    turned = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
-    order = np.argsort(np.linalg.norm(turned - problem.seed, axis=1), kind="stable")
-    return turned[order[: 1 if problem.limits is None else 8]]
+    wrapped = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
+    order = np.argsort(np.linalg.norm(wrapped - problem.seed, axis=1), kind="stable")
+    return wrapped[order[: 1 if problem.limits is None else 8]]
 
 
 def _settled(problem: _Problem, q: FloatArray) -> FloatArray:
@@ -349,10 +349,10 @@ def clear_plane(planes: FloatArray, points: FloatArray) -> FloatArray:
     """Plane (4,) of the span of ``planes`` (k, 4) that is farthest from all ``points`` (m, 4)."""
     if len(planes) == 1:
         return np.asarray(planes[0], dtype=np.float64)
-    heights = planes @ (points / np.linalg.norm(points, axis=1, keepdims=True)).T
+    scales = planes @ (points / np.linalg.norm(points, axis=1, keepdims=True)).T
     candidates = np.random.default_rng(0).normal(size=(CANDIDATES, len(planes)))
     candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
-    clearest = int(np.argmax(np.abs(candidates @ heights).min(axis=1)))
+    clearest = int(np.argmax(np.abs(candidates @ scales).min(axis=1)))
     return np.asarray(candidates[clearest] @ planes, dtype=np.float64)
 
 
@@ -445,7 +445,7 @@ def displacement_between(
     best, least = np.eye(4), np.inf
     for start in range(STARTS):
         try:
-            first = np.eye(4) if start == 0 else _turned(algebra, rng)
+            first = np.eye(4) if start == 0 else _random_displacement(algebra, rng)
             H, residual = _fitted(algebra, points, targets, first)
         except GeometryError:  # not a rigid motion by its eigenvalues: another start may succeed
             continue
@@ -463,7 +463,7 @@ def displacement_between(
     )
 
 
-def _turned(algebra: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _random_displacement(algebra: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Random displacement of about half a turn, as a start value."""
     X = np.tensordot(rng.normal(size=len(algebra)), algebra, axes=1)
     squared = -0.5 * float(np.sum(X * X.T))
