@@ -131,7 +131,7 @@ class Halted:
              code: str = "STOPPED") -> None:  # fmt: skip
         reasons = (Reason(code, "hold"),) if kind == "stopped" else ()
         event = Event(1, time.monotonic_ns(), kind, message, name=name, reasons=reasons)
-        self.state.take_event(event, operator, repeated=repeated)
+        self.state.on_event(event, operator, repeated=repeated)
 
     def words(self, *codes: str) -> str | None:
         self.reasons = tuple(Reason(code, "hold") for code in codes)

@@ -115,7 +115,7 @@ class Bench:
         return query
 
     def answer(self, request: int, accepted: bool, message: str = "", plan: PlanReport | None = None) -> None:
-        self.intake.core_reply(
+        self.intake.on_core_reply(
             Event(9, 9, "reply", request=request, accepted=accepted, message=message, id=ID, plan=plan)
         )
 
@@ -204,9 +204,9 @@ def test_goals_that_run_are_told_with_set_points_and_plan_until_they_end(bench: 
     bench.intake.goal_sample(Message(KEYS.goal("bob"), encode(UpdateGoal(ID, moved))))
     bench.answer(2, True)
     assert bench.intake.running().goals[0].goal.target == moved
-    bench.intake.core_event(Event(10, 10, "goal_started", id=ID))
+    bench.intake.on_core_event(Event(10, 10, "goal_started", id=ID))
     assert bench.intake.running().goals
-    bench.intake.core_event(Event(11, 11, "goal_reached", id=ID))
+    bench.intake.on_core_event(Event(11, 11, "goal_reached", id=ID))
     assert bench.intake.running().goals == ()
 
 

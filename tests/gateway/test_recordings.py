@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from stereoservo.gateway import recordings
-from stereoservo.gateway.publisher import EventLog, KeeperNotes
+from stereoservo.gateway.publisher import EventLog, OperatorNotes
 from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings, Recordings
 from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
@@ -87,7 +87,7 @@ def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch
     bench.orders.add_report(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
     bench.orders.end()
     bench.tell("left", 5)
-    bench.now += recordings.LAST_WORD_S + 0.1
+    bench.now += recordings.REPORT_TIMEOUT_S + 0.1
     bench.orders.poll()
     found = bench.events[-1].images
     assert found is not None
@@ -192,8 +192,8 @@ def test_a_full_disk_ends_a_recording_and_the_next_request_begins_another(
     )  # fmt: skip
     (tmp_path / "run").mkdir()
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
-    notes = KeeperNotes(log)
-    flight = Recordings(plan, log, notes.tell)
+    notes = OperatorNotes(log)
+    flight = Recordings(plan, log, notes.set_note)
     begin = RecordingStart(Settings(250.0), fingerprint())  # type: ignore[arg-type]
 
     def stream(first: int) -> None:
@@ -240,16 +240,16 @@ def test_a_ring_that_is_not_written_is_a_note_until_it_is(tmp_path: Path, monkey
     )  # fmt: skip
     events: list[EventMessage] = []
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
-    notes = KeeperNotes(log)
-    flight = Recordings(plan, log, notes.tell)
+    notes = OperatorNotes(log)
+    flight = Recordings(plan, log, notes.set_note)
     (one,) = rings
-    one.said.append(("warning", "the flight ring is not written: No space left"))
+    one.reports.append(("warning", "the flight ring is not written: No space left"))
     one.trouble = "No space left"
     for _ in range(3):
         flight.poll()
     assert notes.texts == ("the flight ring is not written: No space left",)
     one.trouble = ""
-    one.said.append(("ring_kept", "kept"))
+    one.reports.append(("ring_kept", "kept"))
     flight.poll()
     assert notes.texts == ()
     assert [event.kind for event in events] == ["warning", "ring_kept"]

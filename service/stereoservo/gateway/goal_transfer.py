@@ -57,7 +57,7 @@ def resolve(
 ) -> TransferredGoal:
     """Set-points of a taught goal for the current model and cameras. Raises TransferError."""
     if requested.relative_to is None and not goal.tool:
-        return _as_taught(goal, model)
+        return _recorded_pixels(goal, model)
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
     if goal.model is None:
@@ -76,7 +76,7 @@ def resolve(
                 f"{requested.name!r} was taught with model epoch {goal.model.epoch}, the cell has {model.epoch}: send "
                 'it relative to the "workpiece", or to the "cameras"'
             )
-        change, origin = _nothing_moved(), "where it was taught"
+        change, origin = _identity_change(), "where it was taught"
     else:
         change, origin = _common_change(requested, goal, taught, old, new, model, observations, same)
     points, covariance, names = _points_when_taught(goal, taught, old, new, model, observations, same)
@@ -91,7 +91,7 @@ def resolve(
     return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
 
 
-def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
+def _recorded_pixels(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
     """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
     Relocalization keeps the frame, bit for bit: the goal's points are still those triangulated with the cameras of
@@ -148,7 +148,7 @@ def _same_frame(taught: TaughtModel, model: CellModel) -> bool:
     )
 
 
-def _nothing_moved() -> FrameChange:
+def _identity_change() -> FrameChange:
     return FrameChange(np.eye(4), np.zeros((16, 16)), (), 0.0, 0)
 
 
