@@ -96,7 +96,7 @@ def test_a_body_mounted_anew_is_noticed_and_a_goal_by_the_tool_survives_it():
     here = some_pose(rng)
     now = cameras.sights(placed(BODY, here @ remount) | placed(TOOL, here) | placed(WORK, after), rng)
     still = cameras.sights(placed(BODY, here @ remount) | placed(TOOL, here) | placed(WORK, before), rng)
-    with pytest.raises(TransferError, match=r"the marker body was mounted anew, .* taught with --tool"):
+    with pytest.raises(TransferError, match=r"the marker body was remounted, .* taught with --tool"):
         resolve(TaughtTarget("pick", "cameras", tuple(WORK)), plain, again, still)
     found = resolve(TaughtTarget("pick", "workpiece"), goal, again, now)
     truth = placed(BODY, after @ np.linalg.inv(before) @ hand @ remount)

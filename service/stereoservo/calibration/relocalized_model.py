@@ -175,7 +175,7 @@ def not_explained(
         "not_explained",
         f"no motion of camera {_listed(names)} explains its pixels: chi-square {chi2:.4g} with {freedom} degrees of "
         f"freedom (limit {limit:.4g}), {share:.0%} of them left out as wrong (limit {most:.0%}){ids}. Did markers "
-        "slip, did a joint's zero or another camera move, are ids mixed up? If so calibrate, or check, anew",
+        "slip, did a joint's zero or another camera move, are ids mixed up? If so calibrate, or check, again",
         cameras=names,
         chi2=chi2,
         limit=limit,

@@ -478,7 +478,7 @@ def best_single_joint(
     *,
     thorough: bool = False,
 ) -> tuple[RigModel | None, float]:
-    """Single joint of ``kind`` that best fits the observations ``sights`` at ``angles`` (k,), and its median residual
+    """Single joint of ``kind`` that best fits the ``observations`` at ``angles`` (k,), and its median residual
     [sigmas]; start values are tried until one fits. ``thorough``: unless one fits, or two converge to the same result,
     rotations about axes in all directions are tried, too.
     """

@@ -87,7 +87,7 @@ def resolve(
     if requested.relative_to == "cameras" and not goal.tool:
         _require_same_mounting(goal, model, names, moved)
     elif not goal.tool and not same:
-        note += f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
+        note += f"; this holds if the marker body has not been remounted since model epoch {goal.model.epoch}"
     return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
 
 
@@ -259,7 +259,7 @@ def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int],
     if not worst <= MOUNTED_PX:
         raise TransferError(
             f"at the joints of teaching the model puts marker {names[int(away.max(axis=0).argmax())]} {worst:.1f} px "
-            f"from the goal, {MOUNTED_PX:g} px is allowed: the marker body was mounted anew, or the common markers "
+            f"from the goal, {MOUNTED_PX:g} px is allowed: the marker body was remounted, or the common markers "
             "were moved. A goal that survives this is taught with --tool and sent relative to the workpiece"
         )
 
@@ -277,7 +277,7 @@ def _relative_to_cameras(
     if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
-            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
+            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach again"
         )
     if requested.lines or requested.planes:
         raise TransferError(

@@ -385,7 +385,7 @@ class RefinementJobs:
             raise MessageError(f"refined model epoch {used.epoch} is just being taken in: undo again in a moment")
         base = self._models.of_epoch(used.refined_from)
         if base is None:
-            raise MessageError(f"the file of calibrated model epoch {used.refined_from} is gone: calibrate anew")
+            raise MessageError(f"the file of calibrated model epoch {used.refined_from} is gone: calibrate again")
         self.cancel()
         self._poses.clear()
         text = f"the calibrated model epoch {base.epoch} is back, in place of refined epoch {used.epoch}"

@@ -320,7 +320,7 @@ class HandledEvents:
             self._not_before_ns = time.monotonic_ns()
             set_note(
                 "handled events",
-                f"{path}: was damaged and begins anew. What was taught or calibrated in the moment before the "
+                f"{path}: was damaged and is started empty. What was taught or calibrated in the moment before the "
                 "gateway's start may be missing: look, and repeat it",
             )
 

@@ -122,7 +122,7 @@ class TaughtGoalRegistry:
                     raise TransferError("the cell has no model yet: calibrate first")
                 if epoch not in (None, model.epoch):
                     raise TransferError(
-                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it anew"
+                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it again"
                     )
                 fixed, epoch = fixed_line(fixed, model), model.epoch
             incidences.append(msgspec.structs.replace(spec, fixed=fixed))

@@ -88,7 +88,7 @@ def end_cause(run: RunRecord) -> str:
     if run.cause:
         return run.cause
     if run.machine != machine_start():
-        return "the computer was switched off or started anew while the daemon ran"
+        return "the computer was switched off or restarted while the daemon ran"
     return (
         f"the supervisor (process {run.pid}) was killed (signal 9), by a person or for lack of memory: see "
         "`journalctl -k`"

@@ -538,7 +538,7 @@ def _must_be_zeros(report: CheckReport) -> None:
     if others:
         raise CalibrationError(
             "other_cause",
-            f"a reset of joint zeros does not cure this: {'; '.join(others)}. Remove the cause, or calibrate anew",
+            f"a reset of joint zeros does not cure this: {'; '.join(others)}. Remove the cause, or calibrate again",
             causes=others,
         )
 
@@ -562,7 +562,7 @@ def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> N
                 raise CalibrationError(
                     "not_observable",
                     f"the check does not tell a drift of {cause.subject} from one of {other.subject}: at these stops "
-                    "both move the markers alike. Take a base where their axes are different lines, or calibrate anew",
+                    "both move the markers alike. Take a base where their axes are different lines, or calibrate again",
                     joints=[cause.subject, other.subject],
                 )
 

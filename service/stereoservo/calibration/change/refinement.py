@@ -100,7 +100,7 @@ def refine_model(
     if base.covariance is None:
         raise CalibrationError(
             "no_covariance",
-            f"model epoch {base.epoch} carries no covariance, which a refinement starts from: calibrate anew",
+            f"model epoch {base.epoch} carries no covariance, which a refinement starts from: calibrate again",
         )
     poses = len(samples.positions)
     if poses < LEAST_POSES:
@@ -114,7 +114,7 @@ def refine_model(
             "model_does_not_fit",
             f"not refined: the model does not fit any more: {check.message}. That is what the poses together are most "
             "like; where the cell changed while they were collected, `calibrate --check` tells what it is. Remove the "
-            "cause, or calibrate anew",
+            "cause, or calibrate again",
             causes=[cause.message for cause in check.causes],
         )
     data = examined.problem.data
@@ -137,7 +137,7 @@ def refine_model(
             "step_too_large",
             f"not refined: the step away from calibrated model epoch {base.epoch} has chi-square {whole.chi2:.0f} by "
             f"that model's covariance, {whole.limit:.0f} is allowed: the model does not fit any more. Check it "
-            "(`calibrate --check`), or calibrate anew",
+            "(`calibrate --check`), or calibrate again",
             chi2=whole.chi2,
             limit=whole.limit,
         )
