@@ -104,7 +104,7 @@ def assert_efficient(found, share=0.01):
 
 
 @pytest.mark.parametrize("arms", [ARMS[::2], pytest.param(ARMS, marks=pytest.mark.slow)], ids=["four", "all"])
-def test_estimates_are_efficient_and_say_so(arms):
+def test_estimates_are_efficient_and_state_it(arms):
     assert_efficient([assess(name, SIGMAS[k % 4], 300 + k) for k, name in enumerate(arms)], share=0.001)
 
 
@@ -248,7 +248,7 @@ def test_a_covariance_that_does_not_fit_is_refused(fitted, change, key, words):
     assert caught.value.key == key
 
 
-def test_files_without_covariance_are_read_and_say_so(fitted):
+def test_files_without_covariance_are_read_and_state_it(fitted):
     tree = json.loads(encode_model(fitted))
     del tree["covariance"]
     for joint in tree["statistics"]["joints"]:

@@ -290,7 +290,7 @@ def brown(cell, positions, k1, k2):
 
 
 @pytest.mark.parametrize("cause", ["second radial term", "scale of a joint"])
-def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likelihood(cause):
+def test_terms_that_the_lens_lacks_and_scales_of_joints_are_distinguished_by_likelihood(cause):
     cell = wide_angle(0.0)
     rng = np.random.default_rng(3)
     trials = cell.trials(0.02, rng, 9)

@@ -71,7 +71,7 @@ def false_cause(code, data, kind, camera):
 @pytest.mark.parametrize("seeds", [12, pytest.param(100, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", ["camera", "both", "base", "body"])
 @pytest.mark.parametrize("name", ["rx90", pytest.param("offset_wrist", marks=pytest.mark.slow)])
-def test_no_told_cause_is_false(name, kind, seeds):
+def test_no_reported_cause_is_false(name, kind, seeds):
     """From the bundle that a step has led astray: its residuals step in all cameras."""
     cell = getattr(synthetic, name)()
     clean = cell.trials(SIGMA, np.random.default_rng(1), 7)

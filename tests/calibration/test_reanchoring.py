@@ -275,7 +275,7 @@ def test_without_a_metric_a_camera_is_resected_from_several_poses(stratum):
             assert np.abs(errors(found.model, rig, c, joints)).max() < 5.0 * found.predicted_px
 
 
-def test_a_changed_focal_length_is_said():
+def test_a_changed_focal_length_is_stated():
     rng = np.random.default_rng(0)
     cell = rx90()
     moved = bumped(cell, [1], 5.0, 0.03, rng)

@@ -23,12 +23,12 @@ def reported_scales(report):
 
 
 @pytest.mark.slow  # in the suite: test_wrong_revolute_scale, by the whole fit
-def test_a_factor_that_explains_the_trial_is_told():
+def test_a_factor_that_explains_the_trial_is_reported():
     factors = reported_scales(lambda way: FACTOR * way)
     assert factors[JOINT] == pytest.approx(FACTOR, rel=0.02)
     assert (np.delete(factors, JOINT) == 1.0).all()
 
 
-def test_a_factor_that_helps_but_does_not_explain_is_not_told():
+def test_a_factor_that_helps_but_does_not_explain_is_not_reported():
     """An encoder that bends, too: the best factor mends most of the misfit, what is left is no noise."""
     assert (reported_scales(lambda way: FACTOR * way + 0.4 * way**2) == 1.0).all()

@@ -143,7 +143,7 @@ def test_ellipses_hold_where_errors_are_likely(seed):
     assert verdict.inside > WELL
 
 
-def test_likely_errors_leave_the_parameters_and_are_told():
+def test_likely_errors_leave_the_parameters_and_are_reported():
     """A perfect arm that looks like one with errors, once in hundreds: its model is the one of exact readings."""
     cell, rng = synthetic.rx90(), np.random.default_rng(17)
     positions, index = cell.stops(6)

@@ -188,7 +188,7 @@ def test_a_joint_that_the_stops_do_not_tell_from_another_is_refused() -> None:
     assert sorted(found.data["joints"]) == ["j4", "j6"]
 
 
-def test_a_model_without_covariance_says_that_the_zeros_uncertainty_is_not_carried() -> None:
+def test_a_model_without_covariance_states_that_the_zeros_uncertainty_is_not_carried() -> None:
     bare = msgspec.structs.replace(truth(rx90), covariance=None)
     cured, _ = reset(bare, seen(bare, stops_of(rx90()), 0.01 * np.eye(6)[1], np.random.default_rng(5)))
     assert cured.covariance is None

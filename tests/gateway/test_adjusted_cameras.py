@@ -65,7 +65,7 @@ def test_of_another_model_or_told_again_it_changes_nothing(gateway: Any, ahead: 
     assert gateway.model is before
 
 
-def test_file_that_cannot_be_written_is_told(gateway: Any, tmp_path: Path) -> None:
+def test_file_that_cannot_be_written_is_reported(gateway: Any, tmp_path: Path) -> None:
     before = gateway.model
     path = gateway.models.path(before.epoch)
     path.unlink()

@@ -135,7 +135,7 @@ def test_who_only_looks_renames_nothing(tmp_path: Path) -> None:
     assert store.path(2).exists()
 
 
-def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -> None:
+def test_a_folder_of_models_that_is_gone_is_reported(tmp_path: Path, bench: Bench) -> None:
     store = ModelStore(tmp_path / "gone")
     jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, StubLink()), bench.log, tmp_path / "checks.jsonl")
     jobs.load(0)
@@ -146,7 +146,9 @@ def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -
 
 
 @pytest.mark.parametrize("data", [b"", b'{"schema": 2, "goals": {', b"[" * 60_000, b"\xff", b'{"schema": 9}'])
-def test_a_damaged_file_of_taught_goals_is_set_aside_and_told_once(tmp_path: Path, bench: Bench, data: bytes) -> None:
+def test_a_damaged_file_of_taught_goals_is_set_aside_and_reported_once(
+    tmp_path: Path, bench: Bench, data: bytes
+) -> None:
     path = tmp_path / "taught.json"
     path.write_bytes(data)
     store = TaughtStore(path, recover=bench.notes.set_note)
@@ -217,7 +219,7 @@ def break_disk(patch: pytest.MonkeyPatch, stage: str) -> str:
 
 
 @pytest.mark.parametrize("stage", ["open", "write", "replace"])
-def test_what_cannot_be_written_keeps_its_bytes_is_told_and_ends_nothing(
+def test_what_cannot_be_written_keeps_its_bytes_is_reported_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     directories = CellDirectories("cell", tmp_path, tmp_path)
@@ -346,7 +348,7 @@ def test_a_recording_on_a_full_disk_ends_and_the_rest_is_counted(
     assert kept + left_out == 400
 
 
-def test_a_recording_that_cannot_begin_is_told_and_given_up(
+def test_a_recording_that_cannot_begin_is_reported_and_given_up(
     tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder(tmp_path, bench, monkeypatch)

@@ -55,7 +55,9 @@ class Bench:
         return None if order is None else order.directory
 
 
-def test_a_recording_is_summed_up_once_all_cameras_have_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_is_summed_up_once_all_cameras_have_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames", third="observations")
     bench.orders.check()
     bench.orders.begin(bench.flight)
@@ -81,7 +83,7 @@ def test_a_recording_is_summed_up_once_all_cameras_have_told(tmp_path: Path, mon
     assert bench.events[-1].message.endswith("left: 50 frames; right: 40 frames, 2 left out, the disk is full")
 
 
-def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vision_process_that_states_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames")
     bench.orders.begin(bench.flight)
     bench.orders.add_report(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
@@ -118,7 +120,7 @@ def test_cameras_without_pictures_are_refused_with_the_reason(tmp_path: Path, mo
     assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"
 
 
-def test_a_cell_that_says_nothing_keeps_ten_minutes_in_half_a_gibibyte_and_four_faults(
+def test_a_cell_that_states_nothing_keeps_ten_minutes_in_half_a_gibibyte_and_four_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[tuple[Path, RingLimits]] = []

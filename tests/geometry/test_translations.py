@@ -312,7 +312,7 @@ def test_plane_at_infinity_is_at_the_bound_and_its_covariance_is_right(motions):
     assert within_chi2(costs, freedom)
 
 
-def test_free_points_are_better_than_points_a_priori_and_say_so():
+def test_free_points_are_better_than_points_a_priori_and_state_it():
     ratios = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -479,7 +479,7 @@ def test_the_affine_upgrade_makes_parallels_of_parallels():
     assert np.abs(design @ map_ - scene.X).max() < 1e-8  # an affinity maps it to the truth
 
 
-def test_two_motions_of_which_one_is_bad_cannot_be_told_apart():
+def test_two_motions_of_which_one_is_bad_cannot_be_distinguished():
     rng = np.random.default_rng(7)
     scene, shifts = Scene(rng), shifts_of(rng, 2)
     exact = scene.pixels(scene.moved(shifts))

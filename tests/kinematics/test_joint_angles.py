@@ -111,7 +111,7 @@ def test_the_self_motion_of_seven_joints_is_named(perfect_calibration):
     assert "j4" not in error.value.data["joints"]
 
 
-def test_all_eight_configurations_of_a_wrist_arm_are_told_apart(perfect_calibration):
+def test_all_eight_configurations_of_a_wrist_arm_are_distinguished(perfect_calibration):
     """Shoulder, elbow and wrist, two ways each: an arm with a spherical wrist reaches a pose in eight ways."""
     cell = synthetic.rx90()
     seen, points = perfect_calibration(cell, 5)

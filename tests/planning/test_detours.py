@@ -41,7 +41,7 @@ def solve_border_tasks(virtual, cells, seed, count):
     return solved
 
 
-def test_border_tasks_are_solved_where_the_straight_way_leaves_the_view(virtual, cells):
+def test_border_tasks_are_solved_where_the_straight_path_leaves_the_view(virtual, cells):
     # measured: 100 of 100 on other seeds; a 97 % planner misses one of 12 in 31 % of runs, so one may be missed
     assert solve_border_tasks(virtual, cells, 31, 12) >= 11
 
@@ -90,7 +90,7 @@ def test_every_kind_of_turning_ends_at_the_same_rotation(angle):
         assert abs(hinge[:3] @ normal) < 1e-9  # the hinge lies in the face
 
 
-def test_another_posture_or_winding_where_the_straight_ways_ends_beyond_limits(virtual, cells):
+def test_another_posture_or_winding_where_the_straight_paths_ends_beyond_limits(virtual, cells):
     """Limits that hold the goal's posture, but not the one that the straight way arrives in."""
     rng = np.random.default_rng(50)
     tried = solved = 0

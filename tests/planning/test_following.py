@@ -38,7 +38,7 @@ def test_too_few_samples_are_noticed_between_them(virtual, cells):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 4])
-def test_past_a_wrist_singularity_the_body_stays_on_its_way(virtual, cells, seed):
+def test_past_a_wrist_singularity_the_body_stays_on_its_path(virtual, cells, seed):
     """The fifth joint changes its sign: joints run, yet between the samples the body is where the plan says."""
     rng = np.random.default_rng(seed)
     q = virtual.RX90_MIDDLE.copy()

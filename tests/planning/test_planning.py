@@ -48,7 +48,7 @@ def check_ends(virtual, world, found, T_star):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_straight_ways_are_straight_and_tell_their_approaches(virtual, cells, seed):
+def test_straight_paths_are_straight_and_tell_their_approaches(virtual, cells, seed):
     rng = np.random.default_rng(seed)
     T0, T_star = virtual.random_task(rng, rng.uniform(5, 150), rng.uniform(0.02, 0.4))
     world = virtual.free_arm(rng, T0)
@@ -75,7 +75,7 @@ def test_straight_ways_are_straight_and_tell_their_approaches(virtual, cells, se
 
 
 @pytest.mark.slow
-def test_straight_ways_suffice_for_a_thousand_tasks(virtual, cells):
+def test_straight_paths_suffice_for_a_thousand_tasks(virtual, cells):
     rng = np.random.default_rng(100)
     straight = 0
     for _ in range(1000):
@@ -268,7 +268,7 @@ def test_half_turns_coplanar_faces_and_a_centre_on_target(virtual, cells, angle,
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-9)  # the face stays in its plane
 
 
-def test_half_a_turn_about_any_axis_is_planned_with_the_face_in_sight(virtual, cells):
+def test_half_a_turn_about_any_axis_is_planned_with_the_face_visible(virtual, cells):
     rng = np.random.default_rng(2)
     for _ in range(5):
         T0, T_star = virtual.random_task(rng, 180.0, 0.2)
@@ -373,7 +373,7 @@ def test_limits_that_are_none_are_refused(virtual, cells, change, match):
         start_planning(msgspec.structs.replace(request, limits=limits))
 
 
-def test_a_slower_scale_takes_longer_on_the_same_way(virtual, cells):
+def test_a_slower_scale_takes_longer_on_the_same_path(virtual, cells):
     rng = np.random.default_rng(14)
     T0, T_star = virtual.random_task(rng, 60, 0.2)
     world = virtual.rx90(rng, T0=T0)

@@ -75,7 +75,7 @@ def virtual_rotation(virtual, G, theta):
     return np.eye(4) + np.sin(theta) * G + (1 - np.cos(theta)) * G @ G
 
 
-def test_intervals_of_a_whole_way_for_both_cameras(virtual):
+def test_intervals_of_a_whole_path_for_both_cameras(virtual):
     rng = np.random.default_rng(11)
     T0, T_star = virtual.random_task(rng, 150, 0.3)
     world = virtual.free_arm(rng, T0)
@@ -122,7 +122,7 @@ def surroundings_of(world, points, lenses, cells, lower, upper, keep_outs):
     )  # fmt: skip
 
 
-def test_kernels_enter_the_least_rooms_of_the_references(virtual, cells):
+def test_kernels_enter_the_least_clearances_of_the_references(virtual, cells):
     rng = np.random.default_rng(21)
     lenses = np.array([[-0.1, 322.0, 238.0, 320.0], [0.05, 318.0, 241.0, 320.0]])
     lower, upper = np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, np.inf])

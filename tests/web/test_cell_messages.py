@@ -25,7 +25,7 @@ class Cell:
     def close(self) -> None: ...
 
 
-def test_whatever_a_cell_sends_the_link_goes_on_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whatever_a_cell_sends_the_link_goes_on_and_states_it(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Any] = []
     heard = Event()
 

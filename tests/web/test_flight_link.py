@@ -88,7 +88,7 @@ def test_a_moment_is_what_was_recorded(shown: Shown) -> None:
         assert reasons[-1] == [rows[-1][0], [reason["code"] for reason in state["reasons"]]]
 
 
-def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
+def test_the_goal_is_drawn_and_reported_from_when_it_ran(shown: Shown) -> None:
     before, after = shown.at(GOAL_STEP - 1), shown.at(STEPS - 1)
     assert before["goal"]["goal"]["id"] == ""
     assert after["goal"]["goal"]["id"] == GOAL_ID
@@ -105,7 +105,7 @@ def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
     assert "goal_started" not in [event["event"]["kind"] for event in before["events"]["events"]]
 
 
-def test_it_plays_to_its_end_and_begins_anew(shown: Shown) -> None:
+def test_it_plays_to_its_end_and_begins_again(shown: Shown) -> None:
     shown.at(100)
     shown.link.play(True, 50.0)
 

@@ -45,7 +45,7 @@ def test_a_lease_outlives_the_session_over_which_its_goal_was_sent() -> None:
     assert after.renewed == ["goal"]
 
 
-def test_what_ended_is_renewed_no_more_even_if_its_end_is_told_first_or_never() -> None:
+def test_what_ended_is_renewed_no_more_even_if_its_end_is_reported_first_or_never() -> None:
     leases = Leases(lambda: None)
     with leases.held("quick"):
         leases.on_event(event("goal_reached", "quick"))

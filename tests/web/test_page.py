@@ -214,7 +214,7 @@ def test_the_picture_of_a_dead_camera_is_grey_without_markers_and_its_age_counts
     chrome.value(f"!{OLD.format('right')} && {CAPTION.format('right')}.includes('3 markers')")
 
 
-def test_the_head_says_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrome: Browser) -> None:
+def test_the_head_states_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrome: Browser) -> None:
     at = 1_700_000_000.0
     cell.state = msgspec.structs.replace(
         STATE,

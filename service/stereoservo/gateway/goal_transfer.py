@@ -277,7 +277,8 @@ def _relative_to_cameras(
     if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
-            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach again"
+            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach them "
+            "again"
         )
     if requested.lines or requested.planes:
         raise TransferError(

@@ -96,7 +96,7 @@ def test_calibrated_arm_is_recognised_within_its_covariance(calibrated):
         assert evidence.chi2 <= evidence.threshold
 
 
-def test_the_structure_of_a_learnt_arm_is_told_and_nothing_else(calibrated):
+def test_the_structure_of_a_learnt_arm_is_reported_and_nothing_else(calibrated):
     """Of an elbow arm with a spherical wrist: the first axis meets the second, the upper arm turns in one plane."""
     for arm in (calibrated("rx90", 0), chain_of(exact_model(synthetic.rx90()))):
         told = structure(arm)
@@ -126,7 +126,7 @@ def test_chi_square_of_conditions_that_hold_is_chi_square(calibrated):
         ((4, ("shift", 0.003)), "common_point", (4, 5)),
     ],
 )
-def test_a_third_of_a_degree_and_three_millimetres_are_told_from_none(calibrated, change, condition, joints):
+def test_a_third_of_a_degree_and_three_millimetres_are_distinguished_from_none(calibrated, change, condition, joints):
     model = calibrated("rx90", 0, change)
     evidence = check_condition(model, condition, joints)
     assert not evidence.holds
