@@ -18,8 +18,8 @@ from stereoservo.calibration.lens_estimation import (
     lens_test,
     lenses_explain_more,
     required_lens_model,
-    straight_lenses,
     undistorted,
+    undistorted_lenses,
 )
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
@@ -184,7 +184,7 @@ def test_score_and_wald_agree_with_the_likelihood_ratio():
     cell = synthetic.rx90().with_k1(-0.006)
     trials = cell.trials(0.05, np.random.default_rng(54))
     data = measurements(trials, trials.visible, trials.positions - cell.home)
-    straight = replace(euclidean_start(cell), lenses=straight_lenses(trials))
+    straight = replace(euclidean_start(cell), lenses=undistorted_lenses(trials))
     without = solve(straight, data, "metric")
     free = solve(straight, data, "metric", lenses="radial")
     gain = without.cost - free.cost
@@ -227,7 +227,7 @@ def test_undistorted_trials_are_what_pinholes_see():
     cell = wide_angle(-0.3)
     trials = cell.trials(0.0, np.random.default_rng(0), stops=3, stated=0.1)
     ideal = undistorted(trials, cell.lenses)
-    assert np.abs(ideal.pixels - replace(cell, lenses=straight_lenses(trials)).pixels(trials.positions)).max() < 1e-8
+    assert np.abs(ideal.pixels - replace(cell, lenses=undistorted_lenses(trials)).pixels(trials.positions)).max() < 1e-8
     # Half a pixel to all sides: the area that a raw pixel covers.
     corner = trials.pixels[0, 0, 0]
     around = np.array([undistorted_pixel(cell.lenses[0], corner + d) for d in ((1e-3, 0), (0, 1e-3), (0, 0))])

@@ -9,7 +9,7 @@ import pytest
 
 from stereoservo.calibration.bundle_adjustment import solve
 from stereoservo.calibration.calibration_result import Outlier
-from stereoservo.calibration.diagnosis.outlier_causes import every_pixel, explain_outliers, moved_part
+from stereoservo.calibration.diagnosis.outlier_causes import explain_outliers, moved_part, solution_with_all_pixels
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo_sim.world import synthetic
@@ -79,7 +79,7 @@ def test_no_reported_cause_is_false(name, kind, seeds):
     decided = 0
     for seed in range(seeds):
         trials, camera, stop = bumped_trials(cell, clean, kind, np.random.default_rng([seed, 2]))
-        start = every_pixel(trials, fitted)
+        start = solution_with_all_pixels(trials, fitted)
         astray = solve(start.rig, start.data, "projective", lenses=start.lenses, max_evaluations=20)
         told = moved_part(trials, astray, stop)
         assert not false_cause(told.code, told.data, kind, camera), (seed, told.message)

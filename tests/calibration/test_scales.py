@@ -6,7 +6,7 @@ import pytest
 
 from stereoservo.calibration.diagnosis.joint_scales import trial_scales
 from stereoservo.calibration.initial_reconstruction import initial_reconstruction
-from stereoservo.calibration.lens_estimation import straight_lenses, undistorted
+from stereoservo.calibration.lens_estimation import undistorted, undistorted_lenses
 from stereoservo_sim.world import synthetic
 
 SIGMA, JOINT, FACTOR = 0.1, 2, 1.2
@@ -19,7 +19,7 @@ def reported_scales(report):
     positions = trials.positions.copy()
     positions[:, JOINT] = cell.home[JOINT] + report(positions[:, JOINT] - cell.home[JOINT])
     trials = msgspec.structs.replace(trials, positions=positions)
-    return trial_scales(trials, *initial_reconstruction(undistorted(trials, straight_lenses(trials))))
+    return trial_scales(trials, *initial_reconstruction(undistorted(trials, undistorted_lenses(trials))))
 
 
 @pytest.mark.slow  # in the suite: test_wrong_revolute_scale, by the whole fit

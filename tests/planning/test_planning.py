@@ -330,7 +330,7 @@ def same_bits(one, other):
     assert one.failure == other.failure
     assert (one.plan is None) == (other.plan is None)
     if one.plan is not None:
-        for name in ("times", "joints", "displacements", "shares"):
+        for name in ("times", "joints", "displacements", "path_parameters"):
             np.testing.assert_array_equal(getattr(one.plan, name), getattr(other.plan, name))
         assert one.plan.description == other.plan.description
         assert one.plan.approaches == other.plan.approaches

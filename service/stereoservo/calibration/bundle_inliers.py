@@ -11,7 +11,7 @@ import numpy as np
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.least_squares import RobustLoss
-from stereoservo.calibration.lens_estimation import FREE_LENS, lens_test, required_lens_model, straightened
+from stereoservo.calibration.lens_estimation import FREE_LENS, lens_test, required_lens_model, with_pinhole_cameras
 from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import JointErrors, Measurements, RigModel, residuals
 from stereoservo.calibration.stratum_selection import FitOptions
@@ -53,7 +53,7 @@ def projective_bundle(
         return solution, inliers
     if lenses == "none":
         return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
-    return refine_to_convergence(straightened(solution.rig, every), every, "projective", options, "none", 1e-6)
+    return refine_to_convergence(with_pinhole_cameras(solution.rig, every), every, "projective", options, "none", 1e-6)
 
 
 def refine_to_convergence(

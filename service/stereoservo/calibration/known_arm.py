@@ -28,8 +28,8 @@ from stereoservo.calibration.lens_estimation import (
     prior_of_lenses,
     required_lens_model,
     starting_lenses,
-    straight_lenses,
-    straightened,
+    undistorted_lenses,
+    with_pinhole_cameras,
 )
 from stereoservo.calibration.rig_model import Measurements, RigModel, displacements, residuals
 from stereoservo.calibration.single_joint_fit import measurements
@@ -277,7 +277,7 @@ def _simpler_lenses(
     most = AS_GOOD * open_one.statistics.variance
     simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
     for lenses in simpler[simpler.index(open_one.lenses) + 1 if open_one.lenses in simpler else 0 :]:
-        rig = straightened(open_one.rig, every)
+        rig = with_pinhole_cameras(open_one.rig, every)
         found, kept = refine_to_convergence(rig, every, "metric", options, lenses)
         if found.converged and found.statistics.variance <= most:
             return found, kept
@@ -366,7 +366,7 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
         trials.generators,
         np.zeros((c, 3, 4)),
         np.zeros((m, 4)),
-        straight_lenses(trials),
+        undistorted_lenses(trials),
         True,
     )
     moved = displacements(rig, trials.positions)

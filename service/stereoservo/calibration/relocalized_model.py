@@ -253,7 +253,7 @@ def relocalize_group(
     cameras = [model.cameras[c] for c in group]
     lenses = np.array([camera.lens for camera in cameras])
     views = _renumbered(views, group)
-    start = facing(np.array([camera.matrix for camera in cameras]), views)
+    start = with_positive_depths(np.array([camera.matrix for camera in cameras]), views)
     attempts: list[tuple[MatrixChange, How]] = []
     if model.stratum == "metric":
         assert model.projective_to_euclidean is not None
@@ -304,7 +304,7 @@ def _renumbered(views: Correspondences, group: tuple[int, ...]) -> Correspondenc
     return replace(views, camera=camera)
 
 
-def facing(matrices: FloatArray, views: Correspondences) -> FloatArray:
+def with_positive_depths(matrices: FloatArray, views: Correspondences) -> FloatArray:
     """Matrices (c, 3, 4) with the sign that puts the points in front of their cameras."""
     depths = np.einsum("kj,kj->k", matrices[views.camera, 2], views.points)
     signs = [
@@ -432,7 +432,7 @@ def _least_squares(
         for i in range(k):
             noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += views.covariances[i]
         white = np.linalg.inv(np.linalg.cholesky(noise + F @ sigma @ F.T))
-        fit = matrix_fit(family, lenses, views, _jointly(white))
+        fit = matrix_fit(family, lenses, views, _joint_whitening(white))
         found = minimise(fit, moved, WHOLE)
         if not np.isfinite(found.cost):
             wrong = tuple(int(i) for i in np.unique(views.ids))
@@ -464,7 +464,7 @@ def _least_squares(
     )
 
 
-def _jointly(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def _joint_whitening(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Whitening of rows (k, 2, q) by the inverse root (2 k, 2 k) of the covariance of all pixels together."""
     return lambda rows: (white @ rows.reshape(len(white), -1)).reshape(rows.shape)
 
@@ -746,7 +746,7 @@ def _moved_camera(model: CellModel, one: CameraGroup, k: int) -> MovedCamera:
     camera = model.cameras[one.cameras[k]]
     mine = one.views.select(one.views.camera == k)
     mine = replace(mine, camera=np.zeros_like(mine.camera))
-    old, lens = facing(camera.matrix[None], mine), camera.lens[None]
-    motion_px = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
+    old, lens = with_positive_depths(camera.matrix[None], mine), camera.lens[None]
+    motion_px = predicted(with_positive_depths(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
     moved_px = float(np.sqrt(np.nanmean((motion_px**2).sum(axis=1))))
     return describe_moved_camera(model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px)

@@ -28,7 +28,7 @@ from stereoservo.calibration.calibration_result import (
     build_fit,
     completed,
 )
-from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested_properties
 from stereoservo.calibration.diagnosis.input_corrections import Refit
 from stereoservo.calibration.diagnosis.joint_scales import (
     ScalesError,
@@ -46,9 +46,9 @@ from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
     FREE_LENS,
     FULL_LENS,
-    STARTING_BENDS,
+    INITIAL_DISTORTIONS,
+    distortion_is_possible,
     implausible_lens,
-    lenses_may_bend,
     prior_of_lenses,
     required_lens_model,
     starting_lenses,
@@ -143,7 +143,9 @@ def fit_model(
             raise
         result, notes = absorbed, (note, *review_notes(chain, absorbed, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    report = msgspec.structs.replace(result.report, notes=(*result.report.notes, *notes), untested=untested(chain))
+    report = msgspec.structs.replace(
+        result.report, notes=(*result.report.notes, *notes), untested=untested_properties(chain)
+    )
     return completed(CalibrationFit(model, report), trials)
 
 
@@ -278,7 +280,7 @@ def _with_exact_joints(
     def otherwise(cause: CalibrationError, refused: CalibrationFit | None = None) -> CalibrationFit:
         """The fit from other lenses if one explains the data; else raises the cause, of a ``refused`` fit too."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
-        bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
+        bent = free and (cause.code == "lens_implausible" or distortion_is_possible(chain))
         found = others() if bent else None
         if found is None:
             raise cause if refused is None else diagnose_failure(chain, cause, refit, options, refused)
@@ -585,7 +587,7 @@ def _from_other_lenses(trials: TrialData, epoch: int, created: str, options: Fit
     """The first fit, of those from initial lenses over the whole range, that its noise explains and whose lenses
     are plausible; None if there is none.
     """
-    for bend in STARTING_BENDS:
+    for bend in INITIAL_DISTORTIONS:
         try:
             result = _fit(trials, epoch, created, _silent, options, {}, bend).fit
         except (CalibrationError, GeometryError, np.linalg.LinAlgError):

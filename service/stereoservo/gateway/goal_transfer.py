@@ -27,10 +27,10 @@ from stereoservo.gateway.point_alignment import (
     TransferError,
     align_features,
     align_points,
-    listed,
     reproject_set_points,
     require_still,
 )
+from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import POINTS_NEEDED, AlignmentFrame, family_between
 from stereoservo.geometry.cameras import project_many
 from stereoservo.geometry.homogeneous import move_points
@@ -277,8 +277,8 @@ def _relative_to_cameras(
     if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
-            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach them "
-            "again"
+            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); "
+            "teach them again"
         )
     if requested.lines or requested.planes:
         raise TransferError(

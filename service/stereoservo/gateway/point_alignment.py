@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.gateway.marker_views import MarkerViews, observed_views
 from stereoservo.gateway.observation_cache import MarkerObservations
+from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import AlignmentFrame, Family, align, point_residuals, reprojected
 from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.incidence_alignment import MixedFeatures, align_incidences
@@ -153,11 +154,6 @@ def reproject_set_points(
         raise TransferError(f"{what}, markers leave the images ({', '.join(outside)}); 3 must stay in view")
     left = f"; outside of the image: {', '.join(outside)}" if outside else ""
     return found, known, f"set-points known to {worst:.2f} px{left}"
-
-
-def listed(markers: Iterable[object]) -> str:
-    """Markers as text, separated by commas."""
-    return ", ".join(str(marker) for marker in markers) or "none"
 
 
 # -- edges and faces --

@@ -31,7 +31,7 @@ class FramedModel:
     points: FloatArray
 
 
-def framed(model: CellModel) -> FramedModel:
+def framed_model(model: CellModel) -> FramedModel:
     """Transform the parts of ``model`` into the frame of its stratum."""
     frame = stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean)
     back = np.asarray(np.linalg.inv(frame), dtype=np.float64)

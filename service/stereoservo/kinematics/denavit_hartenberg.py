@@ -37,7 +37,7 @@ from stereoservo.kinematics.axes import (
     axis_angle,
     common_normal,
     euclidean_centres,
-    framed,
+    framed_model,
     joint_axes,
     unit,
 )
@@ -105,12 +105,12 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
     Raises ReadOutError: ``stratum`` (not metric), ``unknown_name``, ``length`` (not positive, or the model's is zero).
     """
     _check_known(model, known)
-    parts = framed(model)
+    parts = framed_model(model)
     axes = axes_at_origin(parts)
     links = conventions(parts)
 
     def read(candidate: CellModel) -> FloatArray:
-        return dh_values(framed(candidate), links, known, model).ravel()
+        return dh_values(framed_model(candidate), links, known, model).ravel()
 
     values = read(model).reshape(-1, 6)
     if not np.isfinite(values[:, :5]).all():
@@ -161,7 +161,7 @@ def metres_per_length(model: CellModel, known: KnownLength) -> float:
     Raises ReadOutError as `denavit_hartenberg`.
     """
     _check_known(model, known)
-    parts = framed(model)
+    parts = framed_model(model)
     axes = axes_at_origin(parts)
     length = _length(parts, axes, dh_table(axes, conventions(parts)), known, model)
     if not length > 0.0:

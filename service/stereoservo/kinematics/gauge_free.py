@@ -17,7 +17,7 @@ import numpy as np
 
 from stereoservo.geometry.cameras import project, projection_jacobian
 from stereoservo.geometry.distortion import distort, distortion_jacobian, has_distortion
-from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, euclidean_centres, framed
+from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, euclidean_centres, framed_model
 from stereoservo.kinematics.covariance import standard_deviations
 from stereoservo.kinematics.denavit_hartenberg import (
     Convention,
@@ -48,7 +48,7 @@ def gauge_free_quantities(model: CellModel) -> list[Quantity]:
     groups = _groups(model)
 
     def read(candidate: CellModel) -> FloatArray:
-        parts = framed(candidate)
+        parts = framed_model(candidate)
         return np.concatenate([group.values(parts) for group in groups])
 
     values = read(model)
@@ -95,7 +95,7 @@ def not_identified(model: CellModel) -> list[tuple[str, str]]:
 
 
 def _groups(model: CellModel) -> list[Group]:
-    parts = framed(model)
+    parts = framed_model(model)
     groups = [marker_images(model, parts), *axis_images(model, parts), *lenses(model)]
     if model.stratum == "affine":
         groups += affine_quantities(model, parts)
@@ -144,16 +144,16 @@ def marker_images(model: CellModel, parts: FramedModel) -> Group:
         for P, lens in zip(parts.cameras, parts.lenses, strict=True):
             ideal = project(P, point[None])[0]
             slope = distortion_jacobian(lens, ideal[None])[0] @ projection_jacobian(P, point[None])[0]
-            moves = sense_of(model) * slope @ (parts.generators @ point).T
+            moves = motion_sign(model) * slope @ (parts.generators @ point).T
             out += [distort(lens, ideal[None])[0], moves.T.ravel()]
         return np.concatenate(out)
 
     return Group(tuple(names), values)
 
 
-def sense_of(model: CellModel) -> float:
-    """Sign of joint motion: -1 if the joints carry the cameras, because `framed` returns generators with the signs of
-    an arm that carries the markers.
+def motion_sign(model: CellModel) -> float:
+    """Sign of joint motion: -1 if the joints carry the cameras, because `framed_model` returns generators with the
+    signs of an arm that carries the markers.
     """
     return -1.0 if model.tip_first else 1.0
 

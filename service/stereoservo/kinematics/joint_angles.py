@@ -100,7 +100,7 @@ def measured_joints(
         raise _behind()
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
-    _refuse_open(problem, q[ordered[0]], largest_deviation)
+    _refuse_undetermined(problem, q[ordered[0]], largest_deviation)
     # Few are left: those in a narrow valley are refined to its minimum, where they are one configuration.
     ends, costs, _ = _descent(problem.linearise, q[ordered], VALLEY_STEPS)
     ordered = np.argsort(costs, kind="stable")
@@ -452,7 +452,7 @@ def _wrapped(q: FloatArray, bounds: FloatArray, seen: ObservedChain) -> FloatArr
     return np.where(revolute, wrapped, q)
 
 
-def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
+def _refuse_undetermined(problem: JointProblem, q: FloatArray, largest: float) -> None:
     """Raise JointAnglesError if the pixels do not determine a joint's position at ``q`` (n,)."""
     slope = problem.linearise(q[None])[1][0]
     _, singular, rows = np.linalg.svd(slope, full_matrices=len(slope) < len(q))

@@ -204,7 +204,7 @@ class ModelFileError(DamagedError):
         self.key = key
 
 
-MAX_BEND = 1.0
+MAX_DISTORTION = 1.0
 """Largest radial parameter of a lens, at its reference radius: images with more distortion cannot be used."""
 RANK_TOLERANCE = 1e-12
 """Least singular value of a matrix of rank 3 or 4, relative to its size."""
@@ -347,11 +347,11 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
                 f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
         strongest = max(camera.lens[[0, *range(4, len(camera.lens))]], key=abs)
-        if abs(strongest) > MAX_BEND:
+        if abs(strongest) > MAX_DISTORTION:
             raise ModelFileError(
                 path,
                 f"cameras[{i}].lens",
-                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_BEND:g} either way is taken",
+                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_DISTORTION:g} either way is taken",
             )
         # Rows of unit length: the result is the rank, independent of units.
         rows = np.linalg.norm(camera.matrix, axis=1)

@@ -234,7 +234,9 @@ def next_candidate(planning: PlanningState) -> None:
         profile = other_profile(p.request.profile, candidate.profile)
         if profile is None:
             continue
-        path = path_of(candidate, profile, p.rotation_variants[candidate.turning], p.centre_translation, p.directions)
+        path = path_coefficients(
+            candidate, profile, p.rotation_variants[candidate.turning], p.centre_translation, p.directions
+        )
         if candidate.profile > 1 and float(np.abs(path[14:]).max()) == LINEAR:
             continue  # only one component: identical to the linear path
         p.path = path
@@ -483,7 +485,9 @@ def _accept_path(p: PlanningState) -> None:
         joints=p.all_joints.copy(),
         displacements=displacements,
         path_parameters=np.arange(SAMPLES) / (SAMPLES - 1.0),
-        description="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
+        description="straight in the joints"
+        if p.stage == Stage.STRAIGHT_IN_JOINTS
+        else path_description(candidate, profile),
         approaches=_approaches(p),
     )
     p.finished = True
@@ -561,7 +565,7 @@ def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float
     return SHAPES["linear"]
 
 
-def path_of(
+def path_coefficients(
     candidate: Candidate,
     profile: Profile,
     turning: FloatArray,
@@ -587,7 +591,7 @@ def other_profile(asked: Profile, nth: int) -> Profile | None:
     return None if profile == asked else profile
 
 
-def name_of(candidate: Candidate, profile: Profile) -> str:
+def path_description(candidate: Candidate, profile: Profile) -> str:
     """Description of a path for the operator."""
     kinds = ("", "one rotation", "the other way round", "planar rotation the other way round")
     kind = (*kinds, "one rotation the other way round")[candidate.turning]

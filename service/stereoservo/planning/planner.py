@@ -147,8 +147,16 @@ def start_planning(request: PlanRequest) -> PlanningState:
 
 def _check(request: PlanRequest) -> None:
     for name in (
-        "operators", "joints", "matrices", "camera_centres", "points", "targets", "kept", "centre", "centre_target"
-    ):  # fmt: skip
+        "operators",
+        "joints",
+        "matrices",
+        "camera_centres",
+        "points",
+        "targets",
+        "must_stay_visible",
+        "centre",
+        "centre_target",
+    ):
         values = getattr(request, name)
         if not np.isfinite(values).all():
             raise PlanRequestError(f"{name} of a plan's request must be finite, got {values.tolist()}")

@@ -10,7 +10,7 @@ import numpy as np
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.geometry.distortion import distort, undistort
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.axes import euclidean_centres, framed, joint_axes
+from stereoservo.kinematics.axes import euclidean_centres, framed_model, joint_axes
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Goal, PlanReport
@@ -280,7 +280,7 @@ class Scene:
         """The scene of ``model``; None if it is not metric, or its cameras are mounted on the arm."""
         if model.stratum != "metric" or model.tip_first:
             return None
-        parts = framed(model)
+        parts = framed_model(model)
         directions = parts.cameras[:, 2, :3] * np.sign(np.linalg.det(parts.cameras[:, :, :3]))[:, None]
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         cameras = [

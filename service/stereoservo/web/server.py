@@ -72,7 +72,7 @@ EXPECTED = (
 
 
 class RecordedLink(Protocol):
-    """Interface of a recording in place of a cell, `web.flight_link.FlightLink`: this module does not depend on
+    """Interface of a recording in place of a cell, `web.playback.PlaybackLink`: this module does not depend on
     recordings.
     """
 

@@ -162,7 +162,7 @@ ELSEWHERE_PX = 8.0
 
 
 @dataclass(frozen=True)
-class _Still:
+class _StillInterval:
     """An interval [ns] in which one camera saw the body still, or (``empty``) did not see it."""
 
     began: int
@@ -211,9 +211,9 @@ def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[Cam
     )
 
 
-def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
+def _intervals(observations: Sequence[CameraObservation]) -> list[_StillInterval]:
     """Intervals in which one camera saw the body still, or did not see it."""
-    found: list[_Still] = []
+    found: list[_StillInterval] = []
     for before, after in pairwise(observations):
         if after.t_shutter_ns - before.t_shutter_ns > GAP_S * 1e9:
             continue
@@ -226,9 +226,9 @@ def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
                 continue
         last = found[-1] if found else None
         if last is not None and last.ended == before.t_shutter_ns and last.empty == few:
-            found[-1] = _Still(last.began, after.t_shutter_ns, few)
+            found[-1] = _StillInterval(last.began, after.t_shutter_ns, few)
         else:
-            found.append(_Still(before.t_shutter_ns, after.t_shutter_ns, few))
+            found.append(_StillInterval(before.t_shutter_ns, after.t_shutter_ns, few))
     return found
 
 

@@ -59,7 +59,7 @@ CLEARLY = 4.0
 
 
 def moved_part(trials: TrialData, start: Solution, stop: int) -> CalibrationError:
-    """Error that states what moved between ``stop`` and the previous one, from a bundle of `every_pixel`:
+    """Error that states what moved between ``stop`` and the previous one, from a bundle of `solution_with_all_pixels`:
     ``camera_moved``, ``moved_together``, or ``camera_or_body_moved`` if the pixels do not determine it.
     """
     cameras = len(trials.cameras)
@@ -119,7 +119,7 @@ def camera_or_body_moved(trials: TrialData, stop: int) -> CalibrationError:
     )
 
 
-def every_pixel(trials: TrialData, result: CalibrationFit) -> Solution:
+def solution_with_all_pixels(trials: TrialData, result: CalibrationFit) -> Solution:
     """The fit's solution with all pixels of its markers, including rejected ones, without priors of its lenses."""
     solution = solution_of(trials, result)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
@@ -254,7 +254,7 @@ def check_lasting_outliers(trials: TrialData, result: CalibrationFit, found: Pre
     cameras = [_lasting(found.outliers[k], found.seen[k]) for k in range(c)]
     moved = [stop for stop in cameras if stop is not None]
     if moved:
-        raise moved_part(trials, every_pixel(trials, result), min(moved))
+        raise moved_part(trials, solution_with_all_pixels(trials, result), min(moved))
     slipped = {}
     for marker in range(m):
         stop = _lasting(found.outliers[:, :, marker].T, found.seen[:, :, marker].T)

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.covariance import propagate_covariance
 from stereoservo.kinematics.inverse.solutions import Case
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
@@ -137,7 +137,7 @@ class _ConditionTest:
         deviation = float(np.linalg.norm(test(self.chain.generators[chosen])))
         if self.model is None or deviation > COARSEST:
             return Evidence(condition, joints, deviation <= EXACT, deviation)
-        values, covariance = propagated(self.model, lambda model: test(model.generators[chosen]))
+        values, covariance = propagate_covariance(self.model, lambda model: test(model.generators[chosen]))
         # More incidences than conditions: the additional ones vary only in second order.
         variances, vectors = np.linalg.eigh(covariance)
         variances, vectors = variances[-freedom:], vectors[:, -freedom:]

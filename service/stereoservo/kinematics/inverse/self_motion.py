@@ -115,7 +115,7 @@ def nearest_by_self_motion(
     return q
 
 
-def slid_inside(
+def moved_within_limits(
     chain: ProjectiveChain,
     points: FloatArray,
     targets: FloatArray,

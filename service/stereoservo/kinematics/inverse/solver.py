@@ -27,13 +27,13 @@ from stereoservo.kinematics.inverse.closed_forms import (
     two_parallel,
     wrist,
 )
-from stereoservo.kinematics.inverse.numerical import POLISH, descended, equivalent_points, linearised
+from stereoservo.kinematics.inverse.numerical import POLISH, equivalent_points, linearised, run_descent
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import (
     NO_MOTION,
+    moved_within_limits,
     nearest_by_self_motion,
     self_motions,
-    slid_inside,
 )
 from stereoservo.kinematics.inverse.solutions import (
     Case,
@@ -112,7 +112,7 @@ def inverse_kinematics(
     if branches is None:
         return _searched(problem)
     starts = chain.zero + branches.steps
-    ends, left = descended(chain, problem.points, problem.targets, starts, damping=POLISH)
+    ends, left = run_descent(chain, problem.points, problem.targets, starts, damping=POLISH)
     solved = left <= tolerance
     if not solved.any():
         return _unreachable(problem, known, ends, left, branches)
@@ -217,11 +217,11 @@ def _searched(problem: _Problem) -> InverseSolutions:
         seed=problem.seed,
     )
     if not len(ends):
-        residual = float(descended(chain, problem.points, problem.targets, best[None], iterations=0)[1][0])
+        residual = float(run_descent(chain, problem.points, problem.targets, best[None], iterations=0)[1][0])
         return _nothing(problem, "numerical", Shortfall(best, residual, None, None))
     if rank < chain.joints:
         ends = np.array([_settled(problem, q) for q in _representatives(problem, ends)])
-        ends, left = descended(chain, problem.points, problem.targets, ends, damping=POLISH)
+        ends, left = run_descent(chain, problem.points, problem.targets, ends, damping=POLISH)
     return _answer(problem, "numerical", ends, left)
 
 
@@ -257,7 +257,7 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
         q, fits = within_limits(chain.kinds, joints[i], problem.seed, problem.limits)
         motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
         if not fits and len(motions) == 1 and problem.limits is not None:
-            slid = slid_inside(chain, problem.points, problem.targets, q, problem.limits, problem.tolerance)
+            slid = moved_within_limits(chain, problem.points, problem.targets, q, problem.limits, problem.tolerance)
             if slid is not None:
                 q, fits = slid, True
                 motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
@@ -268,7 +268,7 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
     inside.sort(key=lambda solution: float(np.linalg.norm(solution[0] - problem.seed)))
     n = chain.joints
     rows = np.array([q for q, _, _ in inside]).reshape(-1, n)
-    residuals = descended(chain, problem.points, problem.targets, rows, iterations=0)[1]
+    residuals = run_descent(chain, problem.points, problem.targets, rows, iterations=0)[1]
     motions_of = tuple(motions for _, _, motions in inside)
     return InverseSolutions(
         case,

@@ -35,7 +35,7 @@ PUBLISH_EVERY_S = 0.2
 EVENTS_SHOWN = 100
 
 
-class FlightLink:
+class PlaybackLink:
     """Plays the recording ``path`` to pages, from its beginning, while it is still being read.
 
     All pages show the same time. Raises RecordingError if it cannot be read.
@@ -52,7 +52,7 @@ class FlightLink:
         self.cell = path.name
         self.view = ModelView()
         self._timeline = Timeline()
-        self._reader = FlightReader(path, self._span, self._timeline)
+        self._reader = PlaybackReader(path, self._span, self._timeline)
         self._lock = threading.Lock()
         self._at_ns = self._span.first_ns
         self._playing, self._speed = True, 1.0
@@ -256,7 +256,7 @@ def _time_of(row: tuple[float | None, ...]) -> float:
     return row[0]
 
 
-class FlightReader:
+class PlaybackReader:
     """Fills a ``timeline`` with a recording of a cell with these ``span``: replays it, and reads its pictures."""
 
     def __init__(self, path: Path, span: RecordedSpan, timeline: Timeline) -> None:

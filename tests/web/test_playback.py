@@ -18,7 +18,7 @@ from stereoservo.recording.replay import RecordingError
 
 pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
 
-from stereoservo.web.flight_link import FlightLink
+from stereoservo.web.playback import PlaybackLink
 
 STEPS = 400
 
@@ -26,7 +26,7 @@ STEPS = 400
 class Shown(NamedTuple):
     """A link that is paused, what it has published by slot, and what was recorded."""
 
-    link: FlightLink
+    link: PlaybackLink
     slots: dict[str, bytes]
     bench: Bench
     target: FeatureTarget
@@ -54,7 +54,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
     bench, target = record_bench(path, STEPS)
     slots: dict[str, bytes] = {}
-    link = FlightLink(path, lambda slot, data, keep: slots.__setitem__(slot, data))
+    link = PlaybackLink(path, lambda slot, data, keep: slots.__setitem__(slot, data))
     link.start()
     link.play(False, None)
 
@@ -123,4 +123,4 @@ def test_what_is_no_recording_is_refused_at_the_start(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     path.write_bytes(b"no recording")
     with pytest.raises(RecordingError):
-        FlightLink(path, lambda slot, data, keep: None)
+        PlaybackLink(path, lambda slot, data, keep: None)
