@@ -196,8 +196,8 @@ def build_fit(
         else:
             own = data.sigmas**2 * (2.0 - residual_expectations(solution))
         by_joint = joint_variances(solution, every.offsets)
-        there = _accuracy(components).deviations(every.offsets - every.corrections)
-        by_error = (by_joint * there[None, :, None] ** 2).sum(axis=3)
+        reading_deviations = _accuracy(components).deviations(every.offsets - every.corrections)
+        by_error = (by_joint * reading_deviations[None, :, None] ** 2).sum(axis=3)
         variances = variances + by_error / solution.statistics.noise
 
     def group(members: BoolArray) -> GroupRms:

@@ -314,10 +314,13 @@ def frame_of_known_arm(model: CellModel, generators: FloatArray) -> FloatArray:
     upgrade = model.projective_to_euclidean
     if upgrade is None:
         raise CalibrationError("bad_data", f"the model is {model.stratum}; a metric one is needed", key="stratum")
-    there = upgrade @ model.generators @ np.linalg.inv(upgrade)
+    transformed = upgrade @ model.generators @ np.linalg.inv(upgrade)
     # H G = G' H, row by row; the last row of H is (0, 0, 0, 1).
     system = np.vstack(
-        [np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4)) for one, other in zip(generators, there, strict=True)]
+        [
+            np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4))
+            for one, other in zip(generators, transformed, strict=True)
+        ]
     )
     found, _, rank, _ = np.linalg.lstsq(system[:, :12], -system[:, 15], rcond=1e-9)
     if rank < 12:
@@ -393,13 +396,13 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
     best: Solution | None = None
     costs: list[float] = []
     for _, cameras, points in sorted(found, key=lambda one: one[0])[:BUNDLES]:
-        there = replace(
+        start = replace(
             rig,
             cameras=np.linalg.inv(N) @ cameras @ to_unit,
             points=to_homogeneous(points) @ np.linalg.inv(to_unit).T,
         )
         try:
-            solution = solve(there, every, "metric", loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
+            solution = solve(start, every, "metric", loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
         except np.linalg.LinAlgError:
             continue  # a guess with points in a focal plane
         robust = float(np.sqrt(1.0 + residuals(solution.rig, every) ** 2).sum())

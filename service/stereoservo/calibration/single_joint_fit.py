@@ -311,8 +311,8 @@ def trial_stops(
             markers_lost=lost,
             strayed=left_trial,
         )
-    apart = [stops[groups[stops] == group] for group in np.unique(groups[stops])]
-    _check_effect(trials, max(apart, key=lambda own: float(np.ptp(positions[own, joint]))), joint)
+    by_group = [stops[groups[stops] == group] for group in np.unique(groups[stops])]
+    _check_effect(trials, max(by_group, key=lambda own: float(np.ptp(positions[own, joint]))), joint)
     return stops, groups[stops], base
 
 

@@ -279,7 +279,7 @@ def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> No
 
     def cameras(ids: Iterable[int]) -> list[str]:
         rows = [views.ids.index(marker) for marker in ids]
-        return [name for name, there in zip(views.cameras, seen[:, rows], strict=True) if bool(there.all())]
+        return [name for name, visible in zip(views.cameras, seen[:, rows], strict=True) if bool(visible.all())]
 
     named: list[tuple[str, Sequence[int]]] = [(f"point {marker}", (marker,)) for marker in features.points]
     named += [(f"edge {a}-{b}", (a, b)) for a, b in features.lines]

@@ -202,14 +202,14 @@ def canonical_pair(
     scale = np.sqrt(s[0] * s[1])
     epipole, null = U[:, 2], Vt[2]
     cross = np.array([[0, -epipole[2], epipole[1]], [epipole[2], 0, -epipole[0]], [-epipole[1], epipole[0], 0]])
-    turned = cross @ (U[:, :2] * (s[:2] / scale)) @ Vt[:2]
+    rotated = cross @ (U[:, :2] * (s[:2] / scale)) @ Vt[:2]
 
     rays_left, rays_right = _nominal_rays(F, N_left, N_right, K, left, right)
     best: tuple[int, FloatArray, FloatArray] | None = None
     for sign in (1.0, -1.0):  # the twisted pair: half a turn about the baseline
-        block = sign * turned + np.outer(epipole, null)
+        block = sign * rotated + np.outer(epipole, null)
         if np.linalg.det(block) < 0:
-            block = sign * turned - np.outer(epipole, null)
+            block = sign * rotated - np.outer(epipole, null)
         scales, depths = _scales_and_depths(block, epipole, rays_left, rays_right)
         front = depths > 0
         # Heights and depths of equal sign mean "in front of both", whichever sign of e' is needed for that.

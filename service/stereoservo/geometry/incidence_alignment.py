@@ -229,14 +229,14 @@ def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) ->
     covariance = np.zeros((m, 8, 8))
     for index in itertools.product(range(len(Ps)), range(2), range(2)):
         c, end, axis = index
-        there = np.isfinite(segments[c]).all(axis=(1, 2))
-        if not there.any():
+        seen_here = np.isfinite(segments[c]).all(axis=(1, 2))
+        if not seen_here.any():
             continue
         more, less = segments.copy(), segments.copy()
         more[c, :, end, axis] += STEP_PX
         less[c, :, end, axis] -= STEP_PX
         slope = ((points(more) - points(less)) / (2.0 * STEP_PX)).reshape(m, 8)
-        slope = np.where(there[:, None], slope * np.where(there, sigmas[c], 0.0)[:, None], 0.0)
+        slope = np.where(seen_here[:, None], slope * np.where(seen_here, sigmas[c], 0.0)[:, None], 0.0)
         covariance += slope[:, :, None] * slope[:, None, :]
     return A, covariance
 

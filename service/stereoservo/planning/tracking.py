@@ -115,8 +115,8 @@ def planned_joints(plan: Plan, begin_s: float, end_s: float, dt_s: float, joints
     left_s = float(plan.times[-1]) - begin_s
     if not left_s > 0.0:
         return PlannedJoints(np.zeros(0), np.zeros(0), 0.0)
-    here, there = sample_plan(plan, begin_s).joints, sample_plan(plan, end_s).joints
-    return PlannedJoints((there - here) / dt_s, here - joints, min(1.0, left_s / FADE_S))
+    start, end = sample_plan(plan, begin_s).joints, sample_plan(plan, end_s).joints
+    return PlannedJoints((end - start) / dt_s, start - joints, min(1.0, left_s / FADE_S))
 
 
 def pace(lag: float) -> float:

@@ -257,8 +257,8 @@ class CellLink:
             )
             found = {
                 marker: (float(u), float(v))
-                for marker, (u, v), there in zip(model.model.marker_ids, pixels, inside, strict=True)
-                if there and marker in seen
+                for marker, (u, v), visible in zip(model.model.marker_ids, pixels, inside, strict=True)
+                if visible and marker in seen
             }
             if len(found) < 3:
                 raise GeometryError(

@@ -113,11 +113,11 @@ def _pinhole(focal: float, centre: FloatArray) -> FloatArray:
 
 def _in_plane(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Motion (4, 4) of the layout into its plane z = 0, and its coordinates (m, 2) there."""
-    middle = layout.mean(axis=0)
-    rows = np.linalg.svd(layout - middle)[2]
+    centroid = layout.mean(axis=0)
+    rows = np.linalg.svd(layout - centroid)[2]
     rows[2] *= np.linalg.det(rows)
-    frame = rigid(rows, -rows @ middle)
-    return frame, (layout - middle) @ rows[:2].T
+    frame = rigid(rows, -rows @ centroid)
+    return frame, (layout - centroid) @ rows[:2].T
 
 
 def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -> FloatArray:
@@ -127,10 +127,10 @@ def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -
     for k in range(c):
         ideal = undistort(lenses[k], views.pixels[k])
         for stop in range(s):
-            there = np.isfinite(ideal[stop]).all(axis=1)
-            if int(there.sum()) >= 4:
+            visible = np.isfinite(ideal[stop]).all(axis=1)
+            if int(visible.sum()) >= 4:
                 try:
-                    found[k, stop] = plane_homography(plane[there], ideal[stop, there])
+                    found[k, stop] = plane_homography(plane[visible], ideal[stop, visible])
                 except GeometryError:
                     continue  # the markers seen in this image are on one line: no homography
     return found
@@ -141,9 +141,9 @@ def _line_lens(views: RigViews, k: int) -> FloatArray:
     camera, lines = views.cameras[k], []
     for members in _layout_lines(views.layout):
         for raw in views.pixels[k][:, members]:
-            there = raw[np.isfinite(raw).all(axis=1)]
-            if len(there) >= LINE_MARKERS:
-                lines.append(there)
+            visible = raw[np.isfinite(raw).all(axis=1)]
+            if len(visible) >= LINE_MARKERS:
+                lines.append(visible)
     lines = lines[:: max(1, len(lines) // LINES)]
     if lines:
         sigma = float(np.median(views.sigmas[k][views.seen[k]]))
@@ -203,11 +203,11 @@ def _plane_pose(H: FloatArray, focal: float, centre: FloatArray) -> FloatArray:
 def _extrinsics(poses: FloatArray) -> FloatArray:
     """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most common places."""
     c = len(poses)
-    there = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
+    known = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
     found = np.full((c, 4, 4), np.nan)
     found[0], done = np.eye(4), {0}
     while len(done) < c:
-        common = [(int((there[j] & there[k]).sum()), j, k) for j in done for k in range(c) if k not in done]
+        common = [(int((known[j] & known[k]).sum()), j, k) for j in done for k in range(c) if k not in done]
         count, j, k = max(common)
         if not count:
             raise refused(
@@ -218,11 +218,11 @@ def _extrinsics(poses: FloatArray) -> FloatArray:
                 " places",
                 "Hold it where two cameras at a time see it",
             )
-        both = np.flatnonzero(there[j] & there[k])
+        both = np.flatnonzero(known[j] & known[k])
         motions = np.array([poses[k, i] @ np.linalg.inv(poses[j, i]) for i in both])
         turns = Rotation.from_matrix(motions[:, :3, :3])
-        apart = [np.median((turns * turns[i].inv()).magnitude()) for i in range(len(both))]
-        found[k] = motions[int(np.argmin(apart))] @ found[j]
+        deviations = [np.median((turns * turns[i].inv()).magnitude()) for i in range(len(both))]
+        found[k] = motions[int(np.argmin(deviations))] @ found[j]
         done.add(k)
     return found
 
@@ -254,11 +254,11 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
     them does not converge, one without distortion may.
     """
     cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
-    there = np.asarray(np.isfinite(points).all(axis=2))
-    reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
+    known = np.asarray(np.isfinite(points).all(axis=2))
+    reference = int(np.argmax((known[:, None] & known[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
     motions = _displacements(points, reference)
     plane, _, _ = planes_at_infinity(motions - np.eye(4), np.ones(len(motions)))
-    everywhere = points[there]
+    everywhere = points[known]
     scaled = scaled_plane(plane, everywhere)
     if scaled is None:
         scaled = scaled_plane(np.array([0.0, 0.0, 0.0, 1.0]), everywhere)
@@ -273,8 +273,8 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
         )
     A = projective_to_euclidean(scaled, np.eye(3))
     affine = A @ motions @ np.linalg.inv(A)
-    turning = 0.5 * (affine - np.linalg.inv(affine))
-    linear, _ = intrinsics_linear(turning, np.ones(len(turning), dtype=bool), np.ones(len(turning)))
+    rotations = 0.5 * (affine - np.linalg.inv(affine))
+    linear, _ = intrinsics_linear(rotations, np.ones(len(rotations), dtype=bool), np.ones(len(rotations)))
     focals = [] if linear is None else [float(np.sqrt(linear[0, 0] * linear[1, 1]))]
     focals = [f for f in focals if FOCAL_RANGE[0] <= f <= FOCAL_RANGE[1]] + list(NOMINAL_FOCALS)
     return [_metric_start(views, cameras, points, reference, scaled, nominal_intrinsics(f), lenses) for f in focals]
@@ -285,9 +285,9 @@ def _displacements(points: FloatArray, reference: int) -> FloatArray:
 
     Raises CalibrationError (``flat_body``, ``too_few_markers``).
     """
-    there, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
+    known, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
     for stop in range(len(points)):
-        common = there[stop] & there[reference]
+        common = known[stop] & known[reference]
         if stop == reference or int(common.sum()) < 6:
             continue
         try:

@@ -105,11 +105,11 @@ def _require_stops(views: RigViews) -> None:
     reached = {0}
     for _ in views.cameras:
         reached |= {k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)}
-    apart = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
-    if apart:
+    unlinked = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
+    if unlinked:
         raise refused(
             "camera_apart",
-            f"camera(s) {', '.join(apart)} never saw the body together with {views.cameras[0].name!r} or a camera "
+            f"camera(s) {', '.join(unlinked)} never saw the body together with {views.cameras[0].name!r} or a camera "
             "that did",
             0,
             1,

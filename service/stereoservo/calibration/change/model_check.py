@@ -166,8 +166,8 @@ def estimate_joint_zeros(
         best = min(ends, key=lambda one: one.chi2)
         noise = max(1.0, best.chi2 / max(1, 2 * len(problem.data.camera) - best.x.size))
         for one in ends:
-            apart = _without_full_turns(model, one.x - best.x)
-            other = float(apart @ best.information @ apart) > AMBIGUOUS
+            difference = _without_full_turns(model, one.x - best.x)
+            other = float(difference @ best.information @ difference) > AMBIGUOUS
             if other and one.chi2 - best.chi2 < AMBIGUOUS * noise:
                 return None  # two postures that the images do not distinguish
         found = best

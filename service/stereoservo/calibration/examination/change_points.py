@@ -178,12 +178,14 @@ def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
     stops = stop_positions(views, instants(views))
     alone = single_joint_motions(stops) >= 0
     median = np.median(stops[alone], axis=0) if alone.any() else views.positions[0]
-    apart = views.at(views.times) - median
-    away = np.abs(apart) > ALONE
+    displaced = views.at(views.times) - median
+    away = np.abs(displaced) > ALONE
     revolute = np.array([kind == "revolute" for kind in views.joint_kinds])
-    apart = np.where(away, apart, 0.0)
-    forms = np.stack([np.where(revolute, np.sin(apart), apart), np.where(revolute, np.cos(apart) - 1.0, 0.0)], axis=2)
-    return forms.reshape(len(apart), -1), np.asarray(away.sum(axis=1) <= 1)
+    displaced = np.where(away, displaced, 0.0)
+    forms = np.stack(
+        [np.where(revolute, np.sin(displaced), displaced), np.where(revolute, np.cos(displaced) - 1.0, 0.0)], axis=2
+    )
+    return forms.reshape(len(displaced), -1), np.asarray(away.sum(axis=1) <= 1)
 
 
 def _track(
@@ -213,8 +215,8 @@ def _fit_track(track: _MarkerTrack, pixels: FloatArray) -> _TrackFit:
     """The course fitted to a track with given pixels (k, 2): least squares (Levenberg, Marquardt), starting from forms
     without depth.
     """
-    middle, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
-    seen, weight = (pixels - middle) / size, (size / track.sigmas)[:, None]
+    centroid, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
+    seen, weight = (pixels - centroid) / size, (size / track.sigmas)[:, None]
     k, r = track.forms.shape
     terms = np.hstack([np.ones((k, 1)), track.forms])
     none = np.zeros_like(terms)
@@ -229,7 +231,7 @@ def _fit_track(track: _MarkerTrack, pixels: FloatArray) -> _TrackFit:
         return (weights * _slopes(terms, none, *_predicted(terms, x)))[:, None]
 
     x = minimise(DenseFit(errors, changes, np.add), x, TRACK_LIMITS).state
-    slopes, predicted = changes(x)[:, 0], _predicted(terms, x)[0] * size + middle
+    slopes, predicted = changes(x)[:, 0], _predicted(terms, x)[0] * size + centroid
     basis, values, _ = np.linalg.svd(slopes, full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]].reshape(2, k, -1).transpose(1, 0, 2).reshape(2 * k, -1)
     return _TrackFit(predicted, _warps(predicted, track.half, track.together), basis)
@@ -266,16 +268,16 @@ def _profile(
         weight = np.repeat(1.0 / track.sigmas, 2)
         W = fit.warps.reshape(-1, q) * weight[:, None]
         Q = fit.basis
-        apart = (track.pixels - fit.predicted).ravel() * weight
-        apart = apart - Q @ (Q.T @ apart)
+        residuals = (track.pixels - fit.predicted).ravel() * weight
+        residuals = residuals - Q @ (Q.T @ residuals)
         begin = 2 * np.searchsorted(track.frames, onsets)
-        moment += sums_from(W * apart[:, None], begin)
+        moment += sums_from(W * residuals[:, None], begin)
         whole += sums_from(W * W, begin)
         information += sums_from(np.einsum("ki,kj->kij", W, W), begin)
         shared = sums_from(np.einsum("ki,kj->kij", Q, W), begin)
         information -= np.einsum("bki,bkj->bij", shared, shared)
-        left += float(apart @ apart)
-        freedom += len(apart) - Q.shape[1]
+        left += float(residuals @ residuals)
+        freedom += len(residuals) - Q.shape[1]
     # Directions that the forms explain as well carry no information.
     scale = np.sqrt(whole.clip(min=1e-12))
     scaled = information / (scale[:, :, None] * scale[:, None, :]) + KNOWN * np.eye(q)
@@ -510,8 +512,8 @@ def change_effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: Flo
     """Change (r, 2) [px] of the pixels, observed minus predicted, by changes ``x`` (q,)."""
     plain = replace(part, joint_slopes=np.zeros((0, len(part.order))))
     changed = plain.residuals_at(changed_state(plain, changes, x))
-    apart = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
-    return np.asarray(apart * part.data.sigmas[:, None])
+    effect = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
+    return np.asarray(effect * part.data.sigmas[:, None])
 
 
 def _onset(

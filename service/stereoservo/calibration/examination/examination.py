@@ -726,7 +726,7 @@ def _by_camera(
 
 def _by_joint(views: RecordedViews, problem: ExaminedFrames, left: FloatArray) -> dict[str, float]:
     """Residuals of the frames in which each joint is away from its median."""
-    there = views.at(views.times)
-    apart = np.abs(there - np.median(there, axis=0))
-    away: BoolArray = apart > AWAY * apart.max(axis=0)
+    positions = views.at(views.times)
+    displaced = np.abs(positions - np.median(positions, axis=0))
+    away: BoolArray = displaced > AWAY * displaced.max(axis=0)
     return {name: _rms(left[away[problem.data.stop, j]]) for j, name in enumerate(views.joint_names)}

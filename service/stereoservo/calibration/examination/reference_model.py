@@ -68,8 +68,8 @@ def estimate_offsets(views: RecordedViews, frames: IntArray) -> OffsetEstimate:
         if 0 < k < len(grid) - 1:
             bend = costs[k - 1] - 2.0 * costs[k] + costs[k + 1]
             finer = late + 0.5 * GRID_S * float(costs[k - 1] - costs[k + 1]) / max(float(bend), 1e-300)
-            if (there := _misfit(views, mine, finer)) <= least:
-                late, least = finer, there
+            if (refined := _misfit(views, mine, finer)) <= least:
+                late, least = finer, refined
             offsets[c] = late if abs(late) >= LEAST_OFFSET_S else 0.0
         left = max(left, least)
     return OffsetEstimate(offsets, left)
@@ -230,21 +230,22 @@ def frame_noise(views: RecordedViews) -> float:
     for c in range(len(views.cameras)):
         mine = np.flatnonzero(views.camera == c)
         pixels = views.pixels[mine] / views.sigmas[mine][..., None]
-        there, resting = views.at(views.times[mine]), still[mine]
-        same = resting[1:] & resting[:-1] & (np.abs(np.diff(there, axis=0)).max(axis=1) <= ALONE)
+        positions, resting = views.at(views.times[mine]), still[mine]
+        same = resting[1:] & resting[:-1] & (np.abs(np.diff(positions, axis=0)).max(axis=1) <= ALONE)
         by_order[1].append(_noise(np.diff(pixels, axis=0)[same], 1))
         for order in ORDERS:
-            apart = np.diff(pixels, n=order, axis=0)
+            differences = np.diff(pixels, n=order, axis=0)
             by_order[order] += [
-                _noise(apart[begin : begin + NOISE_BLOCK], order) for begin in range(0, len(apart), NOISE_BLOCK)
+                _noise(differences[begin : begin + NOISE_BLOCK], order)
+                for begin in range(0, len(differences), NOISE_BLOCK)
             ]
     known = [[one for one in found if math.isfinite(one)] for found in by_order.values()]
     return max(1.0, min((float(np.quantile(found, LOW)) for found in known if found), default=1.0))
 
 
-def _noise(apart: FloatArray, order: int) -> float:
-    """Standard deviation of values with differences ``apart`` of an ``order``, by their median; infinite if too few."""
-    values = np.abs(apart[np.isfinite(apart)])
+def _noise(differences: FloatArray, order: int) -> float:
+    """Standard deviation of values from their ``differences`` of an ``order``, by the median; infinite for too few."""
+    values = np.abs(differences[np.isfinite(differences)])
     if len(values) < LEAST_VALUES:
         return math.inf
     return 1.4826 * float(np.median(values)) / math.sqrt(math.comb(2 * order, order))

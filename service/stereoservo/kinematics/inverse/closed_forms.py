@@ -254,8 +254,8 @@ def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """
     centre = common_point(G)
     ends = axis_points(G[2])
-    share = ends @ centre
-    A = np.array([share[1], -share[0]]) @ ends
+    along_axis = ends @ centre
+    A = np.array([along_axis[1], -along_axis[0]]) @ ends
     first_two = two_general(G[:2], A, H @ A, seed[:2])
     found = []
     for i, (first, second) in enumerate(first_two.steps):

@@ -316,7 +316,7 @@ def descend(
         chain_forward_into(chain, q, H, operators)
         transform_points_into(H, points, moved)
         error = _squared_error(moved, targets)
-        share = damping0
+        damping = damping0
         for _ in range(iterations):
             if not error > 0.0:
                 break
@@ -325,8 +325,8 @@ def descend(
             trace = _normal_equations_into(rows, moved, targets, A, g)
             won = False
             small = False
-            while share < 1e8:
-                if _solve_damped(A, g, share * trace / n + IDLE * weight, L, step):
+            while damping < 1e8:
+                if _solve_damped(A, g, damping * trace / n + IDLE * weight, L, step):
                     longest = 0.0
                     for j in range(n):
                         longest = max(longest, abs(step[j]))
@@ -345,10 +345,10 @@ def descend(
                         break
                     if longest < 1e-14:
                         break
-                share = max(1e-15, 8.0 * share)
+                damping = max(1e-15, 8.0 * damping)
             if not won or small:
                 break
-            share = max(1e-15, 0.1 * share)
+            damping = max(1e-15, 0.1 * damping)
         errors[a] = error
     return ends, errors
 
