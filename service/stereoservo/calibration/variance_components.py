@@ -445,9 +445,9 @@ def estimate_components(
     score, information, _ = none.score()
     if screened and not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
         return None
-    visible = np.diag(information)[1:] > 0.0
+    identifiable = np.diag(information)[1:] > 0.0
     guess = np.zeros(3 * n)
-    guess[visible] = pixels / _mean_squares(reduced)[visible]
+    guess[identifiable] = pixels / _mean_squares(reduced)[identifiable]
     first = np.append(min(pixels, 1.0), guess)
     if near is not None:
         first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])
