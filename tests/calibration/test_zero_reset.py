@@ -22,7 +22,7 @@ from stereoservo.calibration.change.model_check import (
 )
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagated
+from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagate_covariance
 from stereoservo.kinematics.joint_angles import joint_zeros
 from stereoservo.kinematics.joint_reprojection import observed_chain, predicted_pixels
 from stereoservo.kinematics.model import CellModel, load_model, save_model
@@ -146,7 +146,7 @@ def test_drifts_and_predictions_have_their_stated_covariance(make: Callable[[], 
         def pixel(one: CellModel, q: np.ndarray = q) -> np.ndarray:
             return predicted_pixels(observed_chain(one), q, one.marker_points[:1])[0, 0, 0]
 
-        found, covariance = propagated(cured, pixel)
+        found, covariance = propagate_covariance(cured, pixel)
         error = found - pixel(exact, q + drift)
         pixels.append(error @ np.linalg.solve(covariance, error))
     low, high = chi2.ppf([TAIL / 2, 1 - TAIL / 2], len(zeros))

@@ -12,7 +12,7 @@ from stereoservo.calibration.change.model_changes import start_state
 from stereoservo.calibration.examination.change_points import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.examination import examine_views
 from stereoservo.calibration.examination.recorded_views import examined_frames, gaps, single_joint_motions
-from stereoservo.calibration.examination.reference_model import course, frame_noise, learn_reference
+from stereoservo.calibration.examination.reference_model import estimate_offsets, frame_noise, learn_reference
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo_sim.experiments.examined_recordings import (
@@ -189,11 +189,13 @@ def test_stamps_are_reported_against_poses_before_any_camera_is_known() -> None:
     size = late.faults[0].size
     f = len(late.views.camera)
     for frames in (np.arange(f), np.arange(f // 2), np.arange(f // 2, f)):
-        assert course(late.views, frames).offsets == pytest.approx([0.0, size], abs=2e-3)
+        assert estimate_offsets(late.views, frames).offsets == pytest.approx([0.0, size], abs=2e-3)
     half = np.arange(len(plain.camera) // 2)
     moved = plain.shifted(np.where(plain.camera == 0, -0.04, 0.0))
     assert moved.stamped[moved.camera == 0] == pytest.approx(plain.times[plain.camera == 0])
-    assert course(moved, half).offsets[0] - course(plain, half).offsets[0] == pytest.approx(0.04, abs=2e-3)
+    assert estimate_offsets(moved, half).offsets[0] - estimate_offsets(plain, half).offsets[0] == pytest.approx(
+        0.04, abs=2e-3
+    )
 
 
 def test_the_noise_of_frames_is_that_of_the_pixels_where_the_motion_is_even() -> None:
