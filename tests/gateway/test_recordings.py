@@ -93,7 +93,7 @@ def test_a_vision_process_that_states_nothing_is_named(tmp_path: Path, monkeypat
     bench.orders.poll()
     found = bench.events[-1].images
     assert found is not None
-    assert "has not said" in found.cameras[1].why
+    assert "did not report how many" in found.cameras[1].why
     assert not bench.orders.running
 
 
@@ -231,7 +231,7 @@ def test_a_ring_that_is_not_written_is_a_note_until_it_is(tmp_path: Path, monkey
     rings: list[SimpleNamespace] = []
 
     def ring(*_: object) -> SimpleNamespace:
-        rings.append(SimpleNamespace(said=deque(), trouble="", take=lambda _: None, close=lambda: None))
+        rings.append(SimpleNamespace(reports=deque(), trouble="", take=lambda _: None, close=lambda: None))
         return rings[-1]
 
     monkeypatch.setattr(recordings, "RingThread", ring)
