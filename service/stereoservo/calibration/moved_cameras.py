@@ -61,7 +61,7 @@ class Correspondences:
         )
 
 
-class CameraEstimate(NamedTuple):
+class CameraMotionEstimate(NamedTuple):
     """``matrices`` (c, 3, 4) of cameras under estimation, and the ``motion`` D (4, 4) with ``P D`` of the previous
     matrices P; None if the matrices are free.
     """
@@ -80,7 +80,7 @@ class MatrixChange(Protocol):
     def directions(self, matrices: FloatArray) -> FloatArray:
         """Derivative (c, size, 3, 4) of the matrices by the parameters, at 0."""
 
-    def step(self, moved: CameraEstimate, x: FloatArray) -> CameraEstimate:
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
         """The matrices at parameters ``x`` (size,)."""
 
 
@@ -98,10 +98,10 @@ class RigidMotion:
         found: FloatArray = matrices[:, None] @ self.algebra[None]
         return found
 
-    def step(self, moved: CameraEstimate, x: FloatArray) -> CameraEstimate:
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
         assert moved.motion is not None
         motion = exp_twist(np.tensordot(x, self.algebra, axes=1))
-        return CameraEstimate(moved.matrices @ motion, moved.motion @ motion)
+        return CameraMotionEstimate(moved.matrices @ motion, moved.motion @ motion)
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class FreeMatrix:
         rows = np.linalg.svd(matrix.reshape(1, 12))[2][1:]
         return np.asarray(rows.reshape(1, 11, 3, 4) * np.linalg.norm(matrices[0]))
 
-    def step(self, moved: CameraEstimate, x: FloatArray) -> CameraEstimate:
-        return CameraEstimate(moved.matrices + np.tensordot(x, self.directions(moved.matrices)[0], axes=1), None)
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
+        return CameraMotionEstimate(moved.matrices + np.tensordot(x, self.directions(moved.matrices)[0], axes=1), None)
 
 
 def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
@@ -171,7 +171,7 @@ def matrix_fit(
     views: Correspondences,
     whiten: Callable[[FloatArray], FloatArray],
     loss: RobustLoss | None = None,
-) -> DenseFit[CameraEstimate]:
+) -> DenseFit[CameraMotionEstimate]:
     """The fit of matrices; ``whiten`` converts rows (k, 2, q) from px to sigmas."""
     return DenseFit(
         lambda moved: whiten((predicted(moved.matrices, lenses, views) - views.pixels)[..., None])[..., 0],
@@ -182,8 +182,8 @@ def matrix_fit(
 
 
 def fit_with_outliers(
-    family: MatrixChange, starts: list[CameraEstimate], lenses: FloatArray, views: Correspondences
-) -> Minimum[CameraEstimate]:
+    family: MatrixChange, starts: list[CameraMotionEstimate], lenses: FloatArray, views: Correspondences
+) -> Minimum[CameraMotionEstimate]:
     """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids; its
     cost is infinite if every start has points behind a camera.
     """
@@ -281,7 +281,7 @@ def inherited_errors(model: CellModel, group: tuple[int, ...], motion: FloatArra
 def model_jacobian(
     model: CellModel,
     group: tuple[int, ...],
-    moved: CameraEstimate,
+    moved: CameraMotionEstimate,
     views: Correspondences,
     offsets: FloatArray,
 ) -> FloatArray:
@@ -367,7 +367,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     held = model_jacobian(
         model,
         tuple(seen),
-        CameraEstimate(matrices, np.eye(4)),
+        CameraMotionEstimate(matrices, np.eye(4)),
         replace(views, ids=np.full(len(seen), -1)),
         np.zeros((0, len(model.zero))),
     ).reshape(2 * len(seen), -1)
@@ -464,7 +464,9 @@ def predicted_deviation(model: CellModel, errors: list[CameraErrors], joints: Fl
                 rows = entry_jacobian(matrices, lenses, views)
                 variances = np.einsum("kia,ab,kib->ki", rows, one.covariance[mine, mine], rows, optimize=True)
             else:
-                rows = model_jacobian(model, (c,), CameraEstimate(matrices, np.eye(4)), views, joints - model.zero)
+                rows = model_jacobian(
+                    model, (c,), CameraMotionEstimate(matrices, np.eye(4)), views, joints - model.zero
+                )
                 variances = np.einsum("kia,ab,kib->ki", rows, model.covariance.covariance, rows, optimize=True)
             worst = max(worst, float(np.sqrt(variances.max())))
     return worst if some else np.inf

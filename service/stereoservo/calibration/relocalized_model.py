@@ -21,7 +21,7 @@ from stereoservo.calibration.least_squares import minimise
 from stereoservo.calibration.moved_cameras import (
     WHOLE,
     CameraErrors,
-    CameraEstimate,
+    CameraMotionEstimate,
     Correspondences,
     FreeMatrix,
     MatrixChange,
@@ -357,7 +357,7 @@ def _attempt(
     """Fit of one class of motion: robust, then least squares in the full covariance of pixels and model."""
     _refuse_few(model, views, group, family, how)
     free = isinstance(family, FreeMatrix)
-    starts = [CameraEstimate(start, None if free else np.eye(4))]
+    starts = [CameraMotionEstimate(start, None if free else np.eye(4))]
     if free:
         starts += _resected(views, lenses)
     found = fit_with_outliers(family, starts, lenses, views)
@@ -371,7 +371,7 @@ def _attempt(
         _refuse_few(model, inside, group, family, how)
         solved = _least_squares(model, group, family, moved, lenses, inside, offsets)
         settled = bool(np.array_equal(again, keep))
-        moved, keep = CameraEstimate(solved.matrices, solved.motion), again
+        moved, keep = CameraMotionEstimate(solved.matrices, solved.motion), again
         if settled:
             break
     outliers = _outliers(model, group, solved.matrices, lenses, views, keep)
@@ -385,7 +385,7 @@ def _attempt(
 def _inliers(
     model: CellModel,
     group: tuple[int, ...],
-    moved: CameraEstimate,
+    moved: CameraMotionEstimate,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -416,7 +416,7 @@ def _least_squares(
     model: CellModel,
     group: tuple[int, ...],
     family: MatrixChange,
-    moved: CameraEstimate,
+    moved: CameraMotionEstimate,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -469,12 +469,12 @@ def _joint_whitening(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
     return lambda rows: (white @ rows.reshape(len(white), -1)).reshape(rows.shape)
 
 
-def _resected(views: Correspondences, lenses: FloatArray) -> list[CameraEstimate]:
+def _resected(views: Correspondences, lenses: FloatArray) -> list[CameraMotionEstimate]:
     """The matrix of a camera by linear resection and refinement, if the points determine it; else empty."""
     ideal = undistort(lenses[0], views.pixels)
     sigma = float(np.sqrt(np.median(np.trace(views.covariances, axis1=1, axis2=2)) / 2.0))
     try:
-        return [CameraEstimate(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
+        return [CameraMotionEstimate(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
     except GeometryError:
         return []  # the previous matrix may still be near; least squares show whether it is determined
 

@@ -13,7 +13,7 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.calibration.moved_cameras import (
-    CameraEstimate,
+    CameraMotionEstimate,
     Correspondences,
     model_jacobian,
     parameters_of,
@@ -150,7 +150,9 @@ def _covariance(
         np.tile(np.eye(2), (count, 1, 1)),
     )
     group = tuple(int(c) for c in seen)
-    rows = model_jacobian(model, group, CameraEstimate(matrices, np.eye(4)), views, np.zeros((1, len(model.zero))))
+    rows = model_jacobian(
+        model, group, CameraMotionEstimate(matrices, np.eye(4)), views, np.zeros((1, len(model.zero)))
+    )
     rows = rows.reshape(2 * count, parameters_of(model))
     widened: FloatArray = covariance + rows @ model.covariance.covariance @ rows.T
     return widened
