@@ -117,7 +117,7 @@ class Projections(NamedTuple):
     lens_start: IntArray
 
 
-class PixelMeasurements(NamedTuple):
+class Detections(NamedTuple):
     """k measurements: indices of ``camera``, ``stop`` and ``marker`` (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px]."""
 
     camera: IntArray
@@ -136,12 +136,7 @@ class Markers(NamedTuple):
 
 @kernel
 def _rows_into(
-    motions: Motions,
-    projections: Projections,
-    markers: Markers,
-    seen: PixelMeasurements,
-    core: FloatArray,
-    own: FloatArray,
+    motions: Motions, projections: Projections, markers: Markers, seen: Detections, core: FloatArray, own: FloatArray
 ) -> None:
     """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
     first.
@@ -288,9 +283,7 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
             np.ascontiguousarray(generator_basis.transpose(1, 2, 0)),
             _starts(charts.generators),
         )
-        seen = PixelMeasurements(
-            data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here]
-        )
+        seen = Detections(data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here])
         markers = Markers(np.ascontiguousarray(rig.points), point_basis)
         _rows_into(motions, projections, markers, seen, core, own)
         yield here, Rows(core, own, data.marker[here])
