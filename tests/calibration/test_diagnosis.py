@@ -360,7 +360,7 @@ def test_joint_order_is_found_by_free_poses(a, b):
 
 def test_joint_order_that_the_trials_leave_open_is_stated_to_be_open():
     _, trials, _ = cell_and_trials("mixed", 14)
-    assert any("order of the joints" in text for text in fit_model(trials, epoch=1).report.untested_properties)
+    assert any("order of the joints" in text for text in fit_model(trials, epoch=1).report.untested)
 
 
 @pytest.mark.parametrize(("name", "seed"), ARMS)
