@@ -120,7 +120,7 @@ def test_parameters_net_of_gauge_are_all_determined(arms, stratum, parameters):
     fit = solve(rig, data, stratum)
     assert fit.converged
     assert fit.charts.size == parameters
-    assert fit.determined.rank == parameters
+    assert fit.statistics.rank == parameters
 
 
 @pytest.mark.parametrize("stratum", ["projective", "metric"])
@@ -178,7 +178,7 @@ def test_memory_does_not_grow_with_the_images(arms):
         data, _ = measured(cell, cell.stops(stops)[0], np.random.default_rng(6), lost=0.0)
         tracemalloc.start()
         fit = solve(rig, data, "metric")
-        assert fit.determined.rank == fit.charts.size
+        assert fit.statistics.rank == fit.charts.size
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     dense = 2 * len(data.pixels) * fit.charts.size * 8

@@ -115,7 +115,7 @@ def test_noise_raises_no_more_alarms_than_stated():
     assert alarms <= binom.isf(1e-4, 200, 0.02)
 
 
-def test_noise_twice_as_large_as_stated_is_no_cause_but_told():
+def test_noise_twice_as_large_as_stated_is_no_cause_but_reported():
     kinds = [told(rx90(), seed, sigma=2 * SIGMA).kind for seed in range(40)]
     assert set(kinds) == {"unexplained"}
 
@@ -224,7 +224,7 @@ def test_few_markers_show_a_shift_of_the_image():
         assert (found.cause.kind, found.cause.index, found.cause.size) == ("camera", 1, 2)
 
 
-def test_nothing_seen_is_nothing_told():
+def test_nothing_seen_is_nothing_reported():
     found = told(rx90(), 0, mask=np.zeros((2, 14)))
     assert (found.kind, found.measurements, found.chi2) == ("nothing", 0, 0.0)
 
@@ -282,5 +282,5 @@ def test_the_kernel_computes_what_the_reference_says(make, stratum):
                     assert cause.effect_px == pytest.approx(reference.effects[h], rel=1e-7)
 
 
-def test_two_causes_are_told_as_rivals_only_below_the_stated_odds():
+def test_two_causes_are_reported_as_rivals_only_below_the_stated_odds():
     assert pytest.approx(2.0 * np.log(100.0), abs=0.02) == UNCLEAR

@@ -297,7 +297,7 @@ def test_cameras_on_the_tip_are_checked_too() -> None:
     assert named >= 9
 
 
-def test_residuals_are_told_by_joint_camera_and_marker() -> None:
+def test_residuals_are_reported_by_joint_camera_and_marker() -> None:
     report, subject, _, _ = checked(arm(), "marker", 11)
     worst = max(report.per_marker, key=lambda marker: report.per_marker[marker])
     assert worst == subject
@@ -305,7 +305,7 @@ def test_residuals_are_told_by_joint_camera_and_marker() -> None:
     assert set(report.per_camera) == {"cam0", "cam1"}
 
 
-def test_a_models_own_covariance_says_the_same_as_its_trials() -> None:
+def test_a_models_own_covariance_states_the_same_as_its_trials() -> None:
     cell = rx90()
     made_from = cell.trials(SIGMA, np.random.default_rng(1))
     model = fit_model(made_from, epoch=1).model

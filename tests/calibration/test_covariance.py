@@ -16,7 +16,7 @@ from stereoservo.kinematics.covariance import (
     NoCovarianceError,
     covariance_axes,
     displaced_model,
-    propagated,
+    propagate_covariance,
     standard_deviations,
 )
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
@@ -41,7 +41,7 @@ def raw_pixels(model, positions):
 
 def normalised_square(model, function, truth):
     """Squared error of gauge-free quantities against their reported covariance, and its freedoms."""
-    values, covariance = propagated(model, function)
+    values, covariance = propagate_covariance(model, function)
     scale = np.sqrt(np.diag(covariance))
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     known = eigenvalues > 1e-9 * eigenvalues[-1]
@@ -104,7 +104,7 @@ def assert_efficient(found, share=0.01):
 
 
 @pytest.mark.parametrize("arms", [ARMS[::2], pytest.param(ARMS, marks=pytest.mark.slow)], ids=["four", "all"])
-def test_estimates_are_efficient_and_say_so(arms):
+def test_estimates_are_efficient_and_state_it(arms):
     assert_efficient([assess(name, SIGMAS[k % 4], 300 + k) for k, name in enumerate(arms)], share=0.001)
 
 
@@ -140,7 +140,7 @@ def test_propagated_is_the_sample_covariance(fits):
     values, reported = [], []
     for seed in range(fits):
         model = fit_model(cell.trials(0.1, np.random.default_rng(700 + seed), stops=6), epoch=1).model
-        found, covariance = propagated(model, metric_quantities)
+        found, covariance = propagate_covariance(model, metric_quantities)
         assert np.allclose(standard_deviations(model, metric_quantities) ** 2, np.diag(covariance))
         values.append(found)
         reported.append(covariance)
@@ -248,7 +248,7 @@ def test_a_covariance_that_does_not_fit_is_refused(fitted, change, key, words):
     assert caught.value.key == key
 
 
-def test_files_without_covariance_are_read_and_say_so(fitted):
+def test_files_without_covariance_are_read_and_state_it(fitted):
     tree = json.loads(encode_model(fitted))
     del tree["covariance"]
     for joint in tree["statistics"]["joints"]:
@@ -257,4 +257,4 @@ def test_files_without_covariance_are_read_and_say_so(fitted):
     assert model.covariance is None
     assert standard_deviations(model, axis_cosines) is None
     with pytest.raises(NoCovarianceError):
-        propagated(model, axis_cosines)
+        propagate_covariance(model, axis_cosines)

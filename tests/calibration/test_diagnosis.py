@@ -340,7 +340,7 @@ def test_trials_of_exchanged_joints():
 
 
 @pytest.mark.parametrize(("a", "b"), [(1, 2), pytest.param(0, 4, marks=pytest.mark.slow)])
-def test_joint_order_is_told_by_free_poses(a, b):
+def test_joint_order_is_found_by_free_poses(a, b):
     cell = arm("rx90")
     rng = np.random.default_rng(13)
     positions, index = cell.stops(7)
@@ -358,7 +358,7 @@ def test_joint_order_is_told_by_free_poses(a, b):
     assert set(error.data["joints"]) == {f"j{a + 1}", f"j{b + 1}"}
 
 
-def test_joint_order_that_the_trials_leave_open_is_said_to_be_open():
+def test_joint_order_that_the_trials_leave_open_is_stated_to_be_open():
     _, trials, _ = cell_and_trials("mixed", 14)
     assert any("order of the joints" in text for text in fit_model(trials, epoch=1).report.untested)
 
@@ -406,7 +406,7 @@ def test_understated_noise_is_named_with_the_noise(understated, bend):
     assert error.data["factor"] == pytest.approx(understated, rel=0.15)
 
 
-def test_noise_of_one_camera_understated_is_told_by_camera():
+def test_noise_of_one_camera_understated_is_reported_by_camera():
     cell, rng = synthetic.rx90(), np.random.default_rng(4)
     trials = cell.trials(0.05, rng)
     sigmas = trials.sigmas * np.array([1.0, 0.1])[:, None, None]

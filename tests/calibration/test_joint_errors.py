@@ -99,7 +99,7 @@ def test_bundle_with_joint_noise_is_generalised_least_squares():
     P = np.linalg.inv(V) - np.linalg.solve(V, X) @ np.linalg.solve(information, np.linalg.solve(V, X).T)
     assert solution.cost == pytest.approx(y @ P @ y, rel=1e-9)
     assert np.allclose(
-        solution.determined.triangle.T @ solution.determined.triangle,
+        solution.statistics.triangle.T @ solution.statistics.triangle,
         information,
         rtol=1e-6,
         atol=1e-9 * information.max(),
@@ -150,7 +150,7 @@ def test_perfect_arms_have_no_joint_noise():
     "mechanics",
     [pytest.param(None, marks=pytest.mark.slow), "ripple", pytest.param("random", marks=pytest.mark.slow)],
 )
-def test_a_wrong_scale_is_told_beside_errors_of_the_joints(mechanics):
+def test_a_wrong_scale_is_reported_beside_errors_of_the_joints(mechanics):
     cell, rng = synthetic.rx90(), np.random.default_rng(3)
     error = (lambda q: 0.0 * q) if mechanics is None else MECHANICS[mechanics](cell, 0.2e-3, rng)
     trials = trials_with(cell, error, 0.05, rng)
@@ -165,7 +165,7 @@ def test_a_wrong_scale_is_told_beside_errors_of_the_joints(mechanics):
     assert found["deviation"] < 0.01
 
 
-def test_a_scale_that_gears_may_imitate_is_told_as_either():
+def test_a_scale_that_gears_may_imitate_is_reported_as_either():
     """Three per cent too much are a wrong scale, sag, or coupling: the arm calibrates, and the note names all."""
     cell, rng = synthetic.rx90(), np.random.default_rng(3)
     trials = trials_with(cell, lambda q: 0.0 * q, 0.05, rng)
@@ -233,7 +233,7 @@ def test_joints_far_beside_their_readings_are_no_understated_noise():
 
 
 @pytest.mark.slow  # in the suite: test_diagnosis, without joints in mind
-def test_understated_pixels_are_told_from_errors_of_the_joints():
+def test_understated_pixels_are_distinguished_from_errors_of_the_joints():
     """Four times the stated noise and nothing else is the detector's."""
     cell, rng = synthetic.rx90(), np.random.default_rng(5)
     with pytest.raises(CalibrationError) as caught:

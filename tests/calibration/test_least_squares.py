@@ -13,7 +13,7 @@ from stereoservo.calibration.least_squares import (
     deviation_of,
     estimate_beside,
     minimise,
-    numeric_slopes,
+    numeric_jacobian,
     with_rows,
 )
 
@@ -51,10 +51,10 @@ def test_a_fit_ends_where_scipys_does(seed, loss):
     np.testing.assert_allclose(found.state, expected.x, atol=1e-4)
 
 
-def test_numeric_slopes_are_the_analytic_ones():
+def test_numeric_jacobians_are_the_analytic_ones():
     fit, residuals = decay(np.random.default_rng(1))
-    numeric = numeric_slopes(residuals, np.add, 3, 1e-7)(TRUE)
-    np.testing.assert_allclose(numeric, fit.slopes(TRUE), atol=1e-4)
+    numeric = numeric_jacobian(residuals, np.add, 3, 1e-7)(TRUE)
+    np.testing.assert_allclose(numeric, fit.jacobian(TRUE), atol=1e-4)
 
 
 def test_an_impossible_start_is_no_fit_and_a_step_into_the_impossible_is_not_taken():
@@ -80,16 +80,16 @@ def test_a_prior_is_not_weighed_down_and_holds_what_the_data_leave_open():
         prior=lambda x: np.column_stack([np.eye(2), x]),
     )  # fmt: skip
     np.testing.assert_allclose(minimise(open_one, np.array([3.0, 7.0])).state, 1.0 / 3.0, atol=1e-8)
-    assert open_one.determined(np.zeros(2)).rank == 2
+    assert open_one.statistics(np.zeros(2)).rank == 2
 
 
-def test_what_is_determined_is_what_seeds_scatter():
+def test_the_covariance_of_a_fit_is_the_scatter_over_seeds():
     """Squared errors in the stated covariance, and costs, are chi-square."""
     errors = costs = 0.0
     for seed in range(60):
         fit, _ = decay(np.random.default_rng(seed))
         found = minimise(fit, TRUE)
-        determined = fit.determined(found.state)
+        determined = fit.statistics(found.state)
         off = found.state - TRUE
         errors += off @ np.linalg.solve(determined.covariance / determined.noise, off)
         costs += determined.cost
@@ -102,7 +102,7 @@ def test_open_directions_are_counted():
     rows = np.random.default_rng(3).normal(size=(20, 4))
     rows[:, 3] = 1e6 * (rows[:, 0] - rows[:, 1])
     fit = DenseFit(lambda x: (rows @ x)[:, None], lambda x: rows[:, None], np.add)
-    assert fit.determined(np.zeros(4)).rank == 3
+    assert fit.statistics(np.zeros(4)).rank == 3
 
 
 def test_points_are_eliminated_as_if_they_were_not():

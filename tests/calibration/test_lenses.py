@@ -12,14 +12,14 @@ from stereoservo.calibration.calibration_result import intrinsics
 from stereoservo.calibration.diagnosis.joint_scales import model_scales
 from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.lens_estimation import (
-    STARTING_BENDS,
+    INITIAL_DISTORTIONS,
     epipolar_lenses,
     implausible_lens,
     lens_test,
-    lens_wanted,
     lenses_explain_more,
-    straight_lenses,
+    required_lens_model,
     undistorted,
+    undistorted_lenses,
 )
 from stereoservo.calibration.rig_model import LensPriors, RigModel
 from stereoservo.calibration.self_calibration import fit_model
@@ -27,8 +27,8 @@ from stereoservo.calibration.single_joint_fit import measurements
 from stereoservo.calibration.stratum_selection import FitOptions
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.distortion import distort, lens_from_lines
-from stereoservo.kinematics.axes import framed
-from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.axes import framed_model
+from stereoservo.kinematics.covariance import propagate_covariance
 from stereoservo.kinematics.model import ModelFileError, check_model, decode_model, encode_model
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
@@ -83,7 +83,7 @@ def check_seeds(name, seeds):
         assert result.report.lens.model == "radial_centre"
         assert result.report.lens.chi2 > 100 * result.report.lens.limit
         assert_at_the_floor(result)
-        values, covariance = propagated(result.model, camera_angles)
+        values, covariance = propagate_covariance(result.model, camera_angles)
         error = values - true_angles(cell)
         assert (np.abs(error) < 4.5 * np.sqrt(np.diag(covariance))).all(), (seed, error)
         bend = cell.lenses[:, 0] - [camera.lens[0] for camera in result.model.cameras]
@@ -124,7 +124,7 @@ def test_distortion_that_kinematics_absorb_spoils_the_cameras_and_is_flagged(nam
     assert not result.report.chi2_ok
     assert result.report.lens.model == "none"
     assert result.report.lens.chi2 > 50 * result.report.lens.limit
-    values, covariance = propagated(result.model, camera_angles)
+    values, covariance = propagate_covariance(result.model, camera_angles)
     error = np.abs(values - true_angles(cell))
     print(f"{name}: principal points off by {error[:4].max():.1f} px, vergence by {error[4]:.2f} deg")
     assert error[:4].max() > 60.0
@@ -184,7 +184,7 @@ def test_score_and_wald_agree_with_the_likelihood_ratio():
     cell = synthetic.rx90().with_k1(-0.006)
     trials = cell.trials(0.05, np.random.default_rng(54))
     data = measurements(trials, trials.visible, trials.positions - cell.home)
-    straight = replace(euclidean_start(cell), lenses=straight_lenses(trials))
+    straight = replace(euclidean_start(cell), lenses=undistorted_lenses(trials))
     without = solve(straight, data, "metric")
     free = solve(straight, data, "metric", lenses="radial")
     gain = without.cost - free.cost
@@ -227,7 +227,7 @@ def test_undistorted_trials_are_what_pinholes_see():
     cell = wide_angle(-0.3)
     trials = cell.trials(0.0, np.random.default_rng(0), stops=3, stated=0.1)
     ideal = undistorted(trials, cell.lenses)
-    assert np.abs(ideal.pixels - replace(cell, lenses=straight_lenses(trials)).pixels(trials.positions)).max() < 1e-8
+    assert np.abs(ideal.pixels - replace(cell, lenses=undistorted_lenses(trials)).pixels(trials.positions)).max() < 1e-8
     # Half a pixel to all sides: the area that a raw pixel covers.
     corner = trials.pixels[0, 0, 0]
     around = np.array([undistorted_pixel(cell.lenses[0], corner + d) for d in ((1e-3, 0), (0, 1e-3), (0, 0))])
@@ -262,7 +262,7 @@ def test_straight_lines_as_priors():
     for before, after, prior in zip(alone.report.cameras, helped.report.cameras, priors.values(), strict=True):
         assert (np.array(after.lens_std) < np.array(before.lens_std)).all()
         assert (np.array(after.lens_std) < np.sqrt(np.diag(prior.covariance))).all()
-    values, covariance = propagated(helped.model, camera_angles)
+    values, covariance = propagate_covariance(helped.model, camera_angles)
     assert (np.abs(values - true_angles(cell)) < 3.5 * np.sqrt(np.diag(covariance))).all()
 
 
@@ -290,7 +290,7 @@ def brown(cell, positions, k1, k2):
 
 
 @pytest.mark.parametrize("cause", ["second radial term", "scale of a joint"])
-def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likelihood(cause):
+def test_terms_that_the_lens_lacks_and_scales_of_joints_are_distinguished_by_likelihood(cause):
     cell = wide_angle(0.0)
     rng = np.random.default_rng(3)
     trials = cell.trials(0.02, rng, 9)
@@ -303,14 +303,14 @@ def test_terms_that_the_lens_lacks_and_scales_of_joints_are_told_apart_by_likeli
     pixels = pixels + rng.normal(0, 0.02, pixels.shape)
     changed = msgspec.structs.replace(trials, positions=positions, pixels=pixels)
     start = cell.with_k1(-0.2)
-    parts = framed(exact_model(start))
+    parts = framed_model(exact_model(start))
     rig = RigModel(start.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(changed, changed.visible, positions - parts.zero)
     solution = solve(rig, data, "metric", lenses="radial_centre")
     blamed = [scale.joint for scale in model_scales(solution) if scale.wrong]
     assert 2 in blamed or cause != "scale of a joint", model_scales(solution)
     assert lenses_explain_more(solution) == (cause == "second radial term")
-    assert lens_wanted(solution) == ("brown" if cause == "second radial term" else "radial_centre")
+    assert required_lens_model(solution) == ("brown" if cause == "second radial term" else "radial_centre")
 
 
 @pytest.mark.parametrize(
@@ -327,7 +327,7 @@ def test_second_radial_and_tangential_terms_are_estimated_to_their_covariance(k1
     assert result.report.stratum == "metric"
     assert result.report.lens.chi2 > result.report.lens.limit
     assert_at_the_floor(result)
-    values, covariance = propagated(result.model, camera_angles)
+    values, covariance = propagate_covariance(result.model, camera_angles)
     assert (np.abs(values - true_angles(cell)) < 4.5 * np.sqrt(np.diag(covariance))).all()
     for lens, camera, fitted in zip(cell.lenses, result.model.cameras, result.report.cameras, strict=True):
         assert camera.lens.shape == (7,)
@@ -387,7 +387,7 @@ def test_other_lenses_are_tried_before_a_joint_is_blamed(monkeypatch):
     monkeypatch.setattr(self_calibration, "diagnose_failure", lambda *_: blamed)
     fit = fit_model(trials, epoch=1)
     assert fit.report.chi2_ok
-    assert starts[:2] == [None, STARTING_BENDS[0]]
+    assert starts[:2] == [None, INITIAL_DISTORTIONS[0]]
     # Of pinholes nothing is left to a lens: the joint is blamed at once.
     starts.clear()
     with pytest.raises(CalibrationError) as error:

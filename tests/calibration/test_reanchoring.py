@@ -275,7 +275,7 @@ def test_without_a_metric_a_camera_is_resected_from_several_poses(stratum):
             assert np.abs(errors(found.model, rig, c, joints)).max() < 5.0 * found.predicted_px
 
 
-def test_a_changed_focal_length_is_said():
+def test_a_changed_focal_length_is_stated():
     rng = np.random.default_rng(0)
     cell = rx90()
     moved = bumped(cell, [1], 5.0, 0.03, rng)
@@ -330,7 +330,7 @@ def test_what_cannot_be_re_anchored_is_refused_with_what_is_missing():
     wrong = np.radians(20.0) * np.eye(6)[2]
     drifted = sights(moved, cell.held_out(rng, 4, 0.5), rng)
     drifted = RestObservations(
-        tuple(RestPose(pose.joints + wrong * k, pose.sights) for k, pose in enumerate(drifted.poses))
+        tuple(RestPose(pose.joints + wrong * k, pose.samples) for k, pose in enumerate(drifted.poses))
     )
     unexplained = refusal(model, drifted, ("cam1",))
     assert unexplained.code == "not_explained"

@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import binom
 from scipy.stats import chi2 as chi2_distribution
 
-from stereoservo.calibration.bundle_adjustment import jacobian, with_joint_errors_stated
+from stereoservo.calibration.bundle_adjustment import jacobian, with_joint_error_covariance
 from stereoservo.calibration.diagnosis.input_corrections import solution_of
 from stereoservo.calibration.fit_assessment import assess_fit
 from stereoservo.calibration.joint_noise import joint_columns
@@ -121,13 +121,13 @@ def test_exact_parameters_scatter_by_the_errors_of_the_joints(bundle):
         course = features[stop] @ features[stop].T
         V += np.outer(D[:, j], D[:, j]) * (own**2 * same + common**2 * both + giving[j] ** 2 * course)
     X = jacobian(bundle.rig, bundle.charts, np.zeros(bundle.charts.size), bundle.data)
-    pseudo = np.linalg.pinv(X / bundle.determined.sizes) / bundle.determined.sizes[:, None]
+    pseudo = np.linalg.pinv(X / bundle.statistics.sizes) / bundle.statistics.sizes[:, None]
     expected = pseudo @ V @ pseudo.T
-    found = with_joint_errors_stated(bundle, noise).determined.covariance
+    found = with_joint_error_covariance(bundle, noise).statistics.covariance
     scale = np.sqrt(np.diag(expected))
     assert np.allclose(found / np.outer(scale, scale), expected / np.outer(scale, scale), atol=1e-5)
     assert np.trace(found / np.outer(scale, scale)) > 1.2 * np.trace(
-        bundle.determined.covariance / np.outer(scale, scale)
+        bundle.statistics.covariance / np.outer(scale, scale)
     )
 
 
@@ -143,7 +143,7 @@ def test_ellipses_hold_where_errors_are_likely(seed):
     assert verdict.inside > WELL
 
 
-def test_likely_errors_leave_the_parameters_and_are_told():
+def test_likely_errors_leave_the_parameters_and_are_reported():
     """A perfect arm that looks like one with errors, once in hundreds: its model is the one of exact readings."""
     cell, rng = synthetic.rx90(), np.random.default_rng(17)
     positions, index = cell.stops(6)

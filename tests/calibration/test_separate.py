@@ -170,7 +170,7 @@ def test_strokes_of_millimetres_calibrate_where_the_images_show_them(name, half,
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_small_turns_in_noise_calibrate_and_the_text_says_what_helps(seed):
+def test_small_turns_in_noise_calibrate_and_the_text_states_what_helps(seed):
     cell = replace(synthetic.rx90(), ranges=np.full(6, np.radians(2.5)))
     fit = fit_model(cell.trials(0.5, np.random.default_rng(seed), 9), epoch=1)
     said = assess_fit(fit.model, fit.report)

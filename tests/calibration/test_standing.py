@@ -22,7 +22,7 @@ def with_table(cell, rng, sigma=0.05, count=4):
 
 
 @pytest.mark.parametrize("cell", [rx90(), rx90(flat_plate()), gantry()])
-def test_markers_on_a_table_are_told_from_those_on_the_arm(cell):
+def test_markers_on_a_table_are_distinguished_from_those_on_the_arm(cell):
     pixels, sigmas = with_table(cell, np.random.default_rng(1))
     pixels[0, 3:7, -1] = np.nan
     assert static_markers(pixels, sigmas).tolist() == [False] * len(cell.marker_ids) + [True] * 4

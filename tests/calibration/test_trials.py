@@ -72,7 +72,7 @@ def seen_on_the_way(trials, frames=5, samples=9, seen=3):
     )  # fmt: skip
 
 
-def test_what_was_seen_on_the_way_comes_back_and_may_be_missing(trials):
+def test_what_was_seen_on_the_path_comes_back_and_may_be_missing(trials):
     assert decode_trials(encode_trials(trials)).way is None
     way = seen_on_the_way(trials)
     again = decode_trials(encode_trials(wrong(trials, way=way))).way

@@ -22,9 +22,9 @@ from stereoservo.calibration.change.model_check import (
 )
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagated
+from stereoservo.kinematics.covariance import covariance_axes, displaced_model, propagate_covariance
 from stereoservo.kinematics.joint_angles import joint_zeros
-from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+from stereoservo.kinematics.joint_reprojection import observed_chain, predicted_pixels
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.check_report import ZeroReset
 from stereoservo_sim.world.synthetic import SyntheticCell, pan_tilt, rx90
@@ -55,7 +55,7 @@ def calibrated(exact: CellModel, rng: np.random.Generator) -> CellModel:
 
 def seen(exact: CellModel, stops: np.ndarray, drift: np.ndarray, rng: np.random.Generator) -> TrialData:
     """A check of the cell that ``exact`` is the truth about, its encoders off by ``drift``."""
-    pixels = np.moveaxis(predicted_pixels(seen_chain(exact), stops + drift, exact.marker_points), 1, 0)
+    pixels = np.moveaxis(predicted_pixels(observed_chain(exact), stops + drift, exact.marker_points), 1, 0)
     cell = pan_tilt() if exact.tip_first else rx90()
     frame = cell.trials(SIGMA, rng, positions=(stops, np.full(len(stops), -1)))
     return msgspec.structs.replace(
@@ -88,8 +88,8 @@ def test_one_drifted_zero_is_cured_to_the_noise_floor(tmp_path: Path) -> None:
     assert again.status == "holds", again.message
     # Predictions elsewhere, without noise: what is left is the drift's deviation.
     q = cell.held_out(rng, 20)
-    exact = predicted_pixels(seen_chain(model), q + drift, model.marker_points)
-    left = predicted_pixels(seen_chain(cured), q, cured.marker_points) - exact
+    exact = predicted_pixels(observed_chain(model), q + drift, model.marker_points)
+    left = predicted_pixels(observed_chain(cured), q, cured.marker_points) - exact
     assert np.sqrt(np.mean(left**2)) < SIGMA / 2
     save_model(cured, tmp_path / "m.json")
     assert np.array_equal(load_model(tmp_path / "m.json").zero, cured.zero)
@@ -107,7 +107,7 @@ def test_the_zeros_of_all_joints_lost_by_far_are_found_from_nothing() -> None:
     assert told.sigmas_after < 1.3
     # The other program for it takes the model for exact: it must agree within what the model leaves open.
     images = np.moveaxis(data.pixels, 0, 1)
-    alone = joint_zeros(seen_chain(model), model.marker_points, images[:2], SIGMA, data.positions[:2])
+    alone = joint_zeros(observed_chain(model), model.marker_points, images[:2], SIGMA, data.positions[:2])
     assert np.abs(alone.offset - [joint.drift for joint in told.joints]).max() < 3e-3
 
 
@@ -144,9 +144,9 @@ def test_drifts_and_predictions_have_their_stated_covariance(make: Callable[[], 
         q = cell.home[None] + rng.uniform(-0.5, 0.5, (1, n)) * np.asarray(cell.ranges)
 
         def pixel(one: CellModel, q: np.ndarray = q) -> np.ndarray:
-            return predicted_pixels(seen_chain(one), q, one.marker_points[:1])[0, 0, 0]
+            return predicted_pixels(observed_chain(one), q, one.marker_points[:1])[0, 0, 0]
 
-        found, covariance = propagated(cured, pixel)
+        found, covariance = propagate_covariance(cured, pixel)
         error = found - pixel(exact, q + drift)
         pixels.append(error @ np.linalg.solve(covariance, error))
     low, high = chi2.ppf([TAIL / 2, 1 - TAIL / 2], len(zeros))
@@ -188,7 +188,7 @@ def test_a_joint_that_the_stops_do_not_tell_from_another_is_refused() -> None:
     assert sorted(found.data["joints"]) == ["j4", "j6"]
 
 
-def test_a_model_without_covariance_says_that_the_zeros_uncertainty_is_not_carried() -> None:
+def test_a_model_without_covariance_states_that_the_zeros_uncertainty_is_not_carried() -> None:
     bare = msgspec.structs.replace(truth(rx90), covariance=None)
     cured, _ = reset(bare, seen(bare, stops_of(rx90()), 0.01 * np.eye(6)[1], np.random.default_rng(5)))
     assert cured.covariance is None

@@ -13,7 +13,7 @@ import pytest
 from stereoservo.cli import home
 from stereoservo.cli.ik import LearntArm
 from stereoservo.cli.output import CommandError
-from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+from stereoservo.kinematics.joint_reprojection import observed_chain, predicted_pixels
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo_sim.cells import shipped_cell_path
 from stereoservo_sim.world.exact_model import exact_simulated_model
@@ -38,7 +38,7 @@ class ArmInPictures:
 
     def look(self, *_: Any) -> home.Observation:
         model = self.arm.model
-        pixels = predicted_pixels(seen_chain(model), (self.readings + self.off)[None], model.marker_points)[0]
+        pixels = predicted_pixels(observed_chain(model), (self.readings + self.off)[None], model.marker_points)[0]
         pixels += self.rng.normal(0, NOISE_PX, pixels.shape)
         return home.Observation(self.readings.copy(), pixels, np.full(pixels.shape[:2], SIGMA_PX))
 

@@ -298,7 +298,7 @@ def test_a_recording_of_another_version_says_so_and_what_to_do(bench: Any, tmp_p
     said = str(caught.value)
     assert f"state is of version {OLDEST_VERSION - 1}, this program works with version {STATE_VERSION}" in said
     assert "written by stereoservo 0.0.1" in said
-    assert "Replay it with the version that wrote it, or record anew" in said
+    assert "Replay it with the version that wrote it, or record again" in said
     assert "not damaged" in said
     with pytest.raises(StateVersionError) as error:
         decode_state(of_version(STATE_VERSION + 1))

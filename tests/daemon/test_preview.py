@@ -28,7 +28,7 @@ from stereoservo.ports.devices import Frame
 def directories(tmp_path: Path) -> CellDirectories:
     found = CellDirectories("cell", tmp_path, tmp_path)
     create_slot(found.preview_slot("left"), PICTURE_CAPACITY, PICTURE_LAYOUT)
-    create_slot(found.preview_wanted_slot("left"), WANTED_BYTES, WANTED_LAYOUT)
+    create_slot(found.preview_request_slot("left"), WANTED_BYTES, WANTED_LAYOUT)
     return found
 
 

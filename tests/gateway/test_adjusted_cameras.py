@@ -50,7 +50,7 @@ def adjusted(model: CellModel, epoch: int) -> Event:
 
 def test_camera_that_stands_elsewhere_is_so_in_the_model_and_in_its_file(gateway: Any) -> None:
     before = gateway.model
-    gateway.reanchoring.core_event(adjusted(before, before.epoch), fresh=True)
+    gateway.reanchoring.on_core_event(adjusted(before, before.epoch), fresh=True)
     for model in (gateway.model, load_model(gateway.models.path(before.epoch))):
         assert np.array_equal(model.cameras[1].matrix, MATRIX)
         assert np.array_equal(model.cameras[0].matrix, before.cameras[0].matrix)
@@ -61,16 +61,16 @@ def test_camera_that_stands_elsewhere_is_so_in_the_model_and_in_its_file(gateway
 @pytest.mark.parametrize(("ahead", "fresh"), [(1, True), (0, False)])
 def test_of_another_model_or_told_again_it_changes_nothing(gateway: Any, ahead: int, fresh: bool) -> None:
     before = gateway.model
-    gateway.reanchoring.core_event(adjusted(before, before.epoch + ahead), fresh=fresh)
+    gateway.reanchoring.on_core_event(adjusted(before, before.epoch + ahead), fresh=fresh)
     assert gateway.model is before
 
 
-def test_file_that_cannot_be_written_is_told(gateway: Any, tmp_path: Path) -> None:
+def test_file_that_cannot_be_written_is_reported(gateway: Any, tmp_path: Path) -> None:
     before = gateway.model
     path = gateway.models.path(before.epoch)
     path.unlink()
     path.mkdir()
-    gateway.reanchoring.core_event(adjusted(before, before.epoch), fresh=True)
+    gateway.reanchoring.on_core_event(adjusted(before, before.epoch), fresh=True)
     assert np.array_equal(gateway.model.cameras[1].matrix, MATRIX)
     ((kind, fields),) = gateway.log.told
     assert kind == "warning"

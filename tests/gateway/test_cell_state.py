@@ -80,7 +80,7 @@ def vision(slot: Path, limit_s: float) -> Iterator[subprocess.Popen[str]]:
             process.kill()
 
 
-def test_a_killed_camera_process_is_told_before_its_last_frame_is_old(slot: Path, watch: CameraWatch) -> None:
+def test_a_killed_camera_process_is_reported_before_its_last_frame_is_old(slot: Path, watch: CameraWatch) -> None:
     with vision(slot, CAMERA_OPENS_S) as process:  # while a camera opens no beat is missed
         assert said(watch, 0.03) == []
         process.kill()
@@ -90,7 +90,7 @@ def test_a_killed_camera_process_is_told_before_its_last_frame_is_old(slot: Path
     assert "its process has ended" in hint
 
 
-def test_a_camera_process_that_hangs_and_one_whose_camera_is_silent_are_told_apart(
+def test_a_camera_process_that_hangs_and_one_whose_camera_is_silent_are_distinguished(
     slot: Path, watch: CameraWatch
 ) -> None:
     ((level, _, hint),) = said(watch, None)
@@ -131,7 +131,7 @@ class Halted:
              code: str = "STOPPED") -> None:  # fmt: skip
         reasons = (Reason(code, "hold"),) if kind == "stopped" else ()
         event = Event(1, time.monotonic_ns(), kind, message, name=name, reasons=reasons)
-        self.state.take_event(event, operator, repeated=repeated)
+        self.state.on_event(event, operator, repeated=repeated)
 
     def words(self, *codes: str) -> str | None:
         self.reasons = tuple(Reason(code, "hold") for code in codes)
@@ -145,7 +145,7 @@ def halted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Halted:
     return Halted(tmp_path, monkeypatch)
 
 
-def test_the_state_says_who_stopped_the_arm_until_it_is_resumed(halted: Halted) -> None:
+def test_the_state_states_who_stopped_the_arm_until_it_is_resumed(halted: Halted) -> None:
     assert halted.words("STOPPED") is None
     halted.take("stopped", operator="viewer 2")
     assert halted.words("STOPPED") == "stopped by viewer 2"
@@ -159,7 +159,7 @@ def test_the_state_says_who_stopped_the_arm_until_it_is_resumed(halted: Halted) 
     assert halted.words("HELD") is None
 
 
-def test_a_stop_that_came_by_no_wire_or_for_a_cause_says_so(halted: Halted) -> None:
+def test_a_stop_that_came_by_no_wire_or_for_a_cause_states_it(halted: Halted) -> None:
     halted.take("stopped")
     assert halted.words("STOPPED") == "stopped on the cell's host"
     halted.take("stopped", code="CONTACT_EFFORT")

@@ -127,7 +127,7 @@ def test_where_it_is_damaged_nothing_of_before_the_start_is_done_twice(tmp_path:
     assert not second.is_acted_on(after)
     ((topic, text),) = told
     assert topic == "handled events"
-    assert "was damaged and begins anew" in text
+    assert "was damaged and is started empty" in text
     second.mark(after, acted=True)
     second.close()
     third = HandledEvents(path, lambda *note: told.append(note))

@@ -24,7 +24,7 @@ from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.model_updates import RelocalizationJobs
 from stereoservo.gateway.observation_cache import ObservationCache
 from stereoservo.gateway.persistence import Journal, ModelStore, OpenGoalRecord, TaughtStore
-from stereoservo.gateway.publisher import EventLog, KeeperNotes
+from stereoservo.gateway.publisher import EventLog, OperatorNotes
 from stereoservo.gateway.recordings import Recordings
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.gateway.teaching import TaughtGoalRegistry
@@ -50,7 +50,7 @@ class Bench:
 
     def __init__(self) -> None:
         self.log = EventLog("boot", lambda _: None)
-        self.notes = KeeperNotes(self.log)
+        self.notes = OperatorNotes(self.log)
 
     @property
     def events(self) -> list[EventMessage]:
@@ -135,7 +135,7 @@ def test_who_only_looks_renames_nothing(tmp_path: Path) -> None:
     assert store.path(2).exists()
 
 
-def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -> None:
+def test_a_folder_of_models_that_is_gone_is_reported(tmp_path: Path, bench: Bench) -> None:
     store = ModelStore(tmp_path / "gone")
     jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, StubLink()), bench.log, tmp_path / "checks.jsonl")
     jobs.load(0)
@@ -146,10 +146,12 @@ def test_a_folder_of_models_that_is_gone_is_told(tmp_path: Path, bench: Bench) -
 
 
 @pytest.mark.parametrize("data", [b"", b'{"schema": 2, "goals": {', b"[" * 60_000, b"\xff", b'{"schema": 9}'])
-def test_a_damaged_file_of_taught_goals_is_set_aside_and_told_once(tmp_path: Path, bench: Bench, data: bytes) -> None:
+def test_a_damaged_file_of_taught_goals_is_set_aside_and_reported_once(
+    tmp_path: Path, bench: Bench, data: bytes
+) -> None:
     path = tmp_path / "taught.json"
     path.write_bytes(data)
-    store = TaughtStore(path, recover=bench.notes.tell)
+    store = TaughtStore(path, recover=bench.notes.set_note)
     assert store.names == ()
     (note,) = bench.notes.texts
     assert str(path) in note
@@ -217,7 +219,7 @@ def break_disk(patch: pytest.MonkeyPatch, stage: str) -> str:
 
 
 @pytest.mark.parametrize("stage", ["open", "write", "replace"])
-def test_what_cannot_be_written_keeps_its_bytes_is_told_and_ends_nothing(
+def test_what_cannot_be_written_keeps_its_bytes_is_reported_and_ends_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stage: str
 ) -> None:
     directories = CellDirectories("cell", tmp_path, tmp_path)
@@ -235,16 +237,16 @@ def test_what_cannot_be_written_keeps_its_bytes_is_told_and_ends_nothing(
     for seq in (2, 3):
         sample = msgspec.structs.replace(taught_event().samples[0], camera=SETTINGS.cameras[0].name)
         stop = Event(seq, seq, "calibration_sample", id="g", joints=np.zeros(6), samples=(sample,), trial=-1)
-        calibration.core_event(stop, fresh=True)
+        calibration.on_core_event(stop, fresh=True)
     before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
     told = len(log.since(1).events)
     with monkeypatch.context() as patch:
         words = break_disk(patch, stage)
         name, matrix = MODEL.cameras[1].name, 2.0 * MODEL.cameras[1].matrix
         adjusted = Event(4, 4, "camera_adjusted", name=name, matrix=matrix, epoch=MODEL.epoch)
-        cameras.core_event(adjusted, fresh=True)
+        cameras.on_core_event(adjusted, fresh=True)
         assert not teaching.taught(msgspec.structs.replace(taught_event(5), name="place"))
-        calibration.core_event(Event(6, 6, "calibration_finished", id="g"), fresh=True)
+        calibration.on_core_event(Event(6, 6, "calibration_finished", id="g"), fresh=True)
         record_run(partial(end_run, directories, "a cause"))
         log.add("goal_accepted", id="two")
     events = log.since(1).events[told:]
@@ -322,7 +324,7 @@ class Recorder:
             cell=SimpleNamespace(cell=SimpleNamespace(name="cell"), recording=RecordingSection(ring_mib=0)),
         )
         monkeypatch.setattr(recordings, "request_path", lambda _: directory / "images.json")
-        self.recordings = Recordings(plan, bench.log, bench.notes.tell)
+        self.recordings = Recordings(plan, bench.log, bench.notes.set_note)
         self.recordings.request()
         self.start = RecordingStart(SETTINGS, fingerprint())
 
@@ -346,7 +348,7 @@ def test_a_recording_on_a_full_disk_ends_and_the_rest_is_counted(
     assert kept + left_out == 400
 
 
-def test_a_recording_that_cannot_begin_is_told_and_given_up(
+def test_a_recording_that_cannot_begin_is_reported_and_given_up(
     tmp_path: Path, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder(tmp_path, bench, monkeypatch)
@@ -368,18 +370,18 @@ def test_a_recording_that_cannot_begin_is_told_and_given_up(
 
 def test_a_note_is_one_event_however_often_it_changes(bench: Bench) -> None:
     for k in range(100):
-        bench.notes.tell("journal", f"{k} lines are missing")
-        bench.notes.tell("slots", "")
+        bench.notes.set_note("journal", f"{k} lines are missing")
+        bench.notes.set_note("slots", "")
     assert bench.notes.texts == ("99 lines are missing",)
     assert len(bench.events) == 1
-    bench.notes.tell("journal", "")
-    bench.notes.tell("journal", "again")
+    bench.notes.set_note("journal", "")
+    bench.notes.set_note("journal", "again")
     assert len(bench.events) == 2
 
 
 def test_what_a_driver_leaves_out_is_a_note_of_the_whole_run_and_an_event() -> None:
     log = EventLog("boot", lambda _: None)
-    notes = KeeperNotes(log, ("joint 'gripper' is left out",))
-    notes.tell("journal", "records left out")
+    notes = OperatorNotes(log, ("joint 'gripper' is left out",))
+    notes.set_note("journal", "records left out")
     assert notes.texts == ("joint 'gripper' is left out", "records left out")
     assert next(event.message for event in log.since(1).events) == "joint 'gripper' is left out"

@@ -84,7 +84,7 @@ def test_a_goal_survives_exchanged_cameras_and_a_new_calibration(stratum):
     assert np.abs(errors(found.target, new, placed(BODY, hand))).max() < 4.5 * stated(found.note)
 
 
-def test_a_body_mounted_anew_is_noticed_and_a_goal_by_the_tool_survives_it():
+def test_a_body_remounted_is_noticed_and_a_goal_by_the_tool_survives_it():
     rng = np.random.default_rng(12)
     cameras, remount = Cameras(), pose([0.2, -0.1, 0.3], [0.01, 0.02, -0.01])
     model = make_model(rng, cameras, placed(BODY, HAND), 1)
@@ -96,7 +96,7 @@ def test_a_body_mounted_anew_is_noticed_and_a_goal_by_the_tool_survives_it():
     here = some_pose(rng)
     now = cameras.sights(placed(BODY, here @ remount) | placed(TOOL, here) | placed(WORK, after), rng)
     still = cameras.sights(placed(BODY, here @ remount) | placed(TOOL, here) | placed(WORK, before), rng)
-    with pytest.raises(TransferError, match=r"the marker body was mounted anew, .* taught with --tool"):
+    with pytest.raises(TransferError, match=r"the marker body was remounted, .* taught with --tool"):
         resolve(TaughtTarget("pick", "cameras", tuple(WORK)), plain, again, still)
     found = resolve(TaughtTarget("pick", "workpiece"), goal, again, now)
     truth = placed(BODY, after @ np.linalg.inv(before) @ hand @ remount)
@@ -179,7 +179,7 @@ def test_as_taught_the_pixels_stay_what_they_were():
 
 
 @pytest.mark.parametrize("stratum", STRATA)
-def test_as_taught_in_a_camera_that_was_moved_and_found_anew_since(stratum):
+def test_as_taught_in_a_camera_that_was_moved_and_found_again_since(stratum):
     goal, model, sights, _ = moved_workpiece(np.random.default_rng(2), stratum)
     D = np.eye(4) + 0.02 * np.random.default_rng(3).normal(size=(4, 4))  # of the frame of that camera alone
     left, right = model.cameras

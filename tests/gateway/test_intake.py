@@ -115,7 +115,7 @@ class Bench:
         return query
 
     def answer(self, request: int, accepted: bool, message: str = "", plan: PlanReport | None = None) -> None:
-        self.intake.core_reply(
+        self.intake.on_core_reply(
             Event(9, 9, "reply", request=request, accepted=accepted, message=message, id=ID, plan=plan)
         )
 
@@ -192,7 +192,7 @@ def test_a_plan_is_handed_on_and_not_kept_for_retries(bench: Bench) -> None:
     assert [reply.plan for _, reply in bench.replies.sent] == [plan, None]
 
 
-def test_goals_that_run_are_told_with_set_points_and_plan_until_they_end(bench: Bench) -> None:
+def test_goals_that_run_are_reported_with_set_points_and_plan_until_they_end(bench: Bench) -> None:
     plan = PlanReport("stereo", "straight", 2.5, (), (0.0, 1.0), {"j1": (0.0, 0.1)}, {})
     bench.goal(Goal(ID, TaughtTarget("pick")), "bob")
     assert bench.intake.running().goals == (), "it is not accepted yet"
@@ -204,9 +204,9 @@ def test_goals_that_run_are_told_with_set_points_and_plan_until_they_end(bench: 
     bench.intake.goal_sample(Message(KEYS.goal("bob"), encode(UpdateGoal(ID, moved))))
     bench.answer(2, True)
     assert bench.intake.running().goals[0].goal.target == moved
-    bench.intake.core_event(Event(10, 10, "goal_started", id=ID))
+    bench.intake.on_core_event(Event(10, 10, "goal_started", id=ID))
     assert bench.intake.running().goals
-    bench.intake.core_event(Event(11, 11, "goal_reached", id=ID))
+    bench.intake.on_core_event(Event(11, 11, "goal_reached", id=ID))
     assert bench.intake.running().goals == ()
 
 
@@ -232,7 +232,7 @@ def test_streamed_set_points_and_acknowledgements_are_put_on_the_goals_key(bench
     assert bench.kinds() == []
 
 
-def test_a_stream_that_is_refused_is_told_once_a_second(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_that_is_refused_is_reported_once_a_second(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(intake_module.time, "monotonic", lambda: now)
     wrong = encode(UpdateGoal(ID, FeatureTarget({"middle": POINTS["left"]})))
@@ -254,7 +254,7 @@ def test_the_tool_of_a_taught_goal_is_remembered_with_its_request(bench: Bench) 
     assert bench.teaching.expected == [(1, (0, 1, 2))]
 
 
-def test_a_put_goal_is_told_by_an_event_when_it_is_refused(bench: Bench) -> None:
+def test_a_put_goal_is_reported_by_an_event_when_it_is_refused(bench: Bench) -> None:
     bench.intake.goal_sample(Message(KEYS.goal("anna"), b'{"id": "x"}'))
     bench.intake.goal_sample(Message("stereoservo/v1/demo/goal/**", encode(Goal(ID, JointTarget({"j1": 0.1})))))
     assert bench.kinds() == ["goal_refused", "goal_refused"]

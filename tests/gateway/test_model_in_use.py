@@ -47,9 +47,9 @@ def test_a_model_is_reported_once_the_core_works_with_it(
     jobs._send_to_core(MODEL, "g", what, tmp_path / "m.json")
     for step in order:
         if isinstance(step, int):
-            jobs.take_epoch(step)
+            jobs.on_model_applied(step)
         else:
-            jobs.core_event(step, fresh=True)
+            jobs.on_core_event(step, fresh=True)
         assert [event.kind for event in log.since(1).events] == [kind] * (5 in order[: order.index(step) + 1])
     assert not jobs.busy
 
@@ -58,7 +58,7 @@ def test_a_model_that_another_has_overtaken_is_no_longer_waited_for(tmp_path: Pa
     log = EventLog("boot", lambda _: None)
     jobs = CalibrationJobs(example_settings(), ModelStore(tmp_path), LINK, log, tmp_path / "checks.jsonl")
     jobs._send_to_core(MODEL, "g", RESULT, tmp_path / "m.json")
-    jobs.take_epoch(6)
+    jobs.on_model_applied(6)
     (told,) = log.since(1).events
     assert (told.kind, told.id) == ("calibration_failed", "g")
     assert "epoch 6" in told.message
@@ -70,10 +70,10 @@ def test_a_model_of_moved_cameras_is_taken_once_the_core_works_with_it(order: tu
     log, taken = EventLog("boot", lambda _: None), list[int]()
     jobs = RelocalizationJobs(ModelStore(tmp_path), LINK, log, lambda: None, lambda model: taken.append(model.epoch))
     fit: Any = SimpleNamespace(cameras=("left",), goal="g")
-    jobs._hand_over(MODEL, SimpleNamespace(message="moved", model="m.json"), fit)  # type: ignore[arg-type]
+    jobs._replace_model(MODEL, SimpleNamespace(message="moved", model="m.json"), fit)  # type: ignore[arg-type]
     for step in order:
         if isinstance(step, int):
-            jobs.take_epoch(step)
+            jobs.on_model_applied(step)
         else:
-            jobs.core_event(step, fresh=True)
+            jobs.on_core_event(step, fresh=True)
         assert taken == [5] * (5 in order[: order.index(step) + 1])

@@ -48,7 +48,7 @@ def test_what_moves_is_where_it_was_seen_last():
     assert not now[1].moves
 
 
-def test_what_moves_is_told_of_one_moment_by_cameras_that_no_trigger_joins():
+def test_what_moves_is_reported_of_one_moment_by_cameras_that_no_trigger_joins():
     """At 100 px/s; two pictures half a period apart made a point of it that it never was at."""
     sights, late_ns = ObservationCache({"left": 0.0, "right": 0.0}), PERIOD_NS // 2
     for k in range(5):

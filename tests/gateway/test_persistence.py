@@ -82,7 +82,7 @@ def test_a_file_of_taught_goals_with_a_cut_matrix_names_it(tmp_path: Path) -> No
         TaughtStore(path)
 
 
-def test_a_damaged_file_of_taught_goals_is_told_and_kept(tmp_path: Path) -> None:
+def test_a_damaged_file_of_taught_goals_is_reported_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "taught.json"
     path.write_text('{"schema": 1, "goals": {"a": ')
     with pytest.raises(TaughtFileError, match=r"taught\.json"):

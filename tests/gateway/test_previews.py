@@ -53,13 +53,13 @@ def test_pictures_are_asked_for_and_published_only_where_somebody_subscribes(
     directories = CellDirectories("cell", tmp_path, tmp_path)
     for camera in ("left", "right"):
         create_slot(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
-        create_slot(directories.preview_wanted_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
+        create_slot(directories.preview_request_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
     slots = {
         camera: SlotWriter(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
         for camera in ("left", "right")
     }
     wanted = {
-        camera: SlotReader(directories.preview_wanted_slot(camera), WANTED_LAYOUT) for camera in ("left", "right")
+        camera: SlotReader(directories.preview_request_slot(camera), WANTED_LAYOUT) for camera in ("left", "right")
     }
     publishers = {"left": Publisher(), "right": Publisher()}
     clock = Clock()

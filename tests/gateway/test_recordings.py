@@ -13,7 +13,7 @@ import msgspec
 import pytest
 
 from stereoservo.gateway import recordings
-from stereoservo.gateway.publisher import EventLog, KeeperNotes
+from stereoservo.gateway.publisher import EventLog, OperatorNotes
 from stereoservo.gateway.recordings import CannotRecordError, ImageRecordings, Recordings
 from stereoservo.messages.cell_file import RecordingSection
 from stereoservo.messages.directories import CellDirectories
@@ -55,7 +55,9 @@ class Bench:
         return None if order is None else order.directory
 
 
-def test_a_recording_is_summed_up_once_all_cameras_have_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recording_is_summed_up_once_all_cameras_have_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames", third="observations")
     bench.orders.check()
     bench.orders.begin(bench.flight)
@@ -81,17 +83,17 @@ def test_a_recording_is_summed_up_once_all_cameras_have_told(tmp_path: Path, mon
     assert bench.events[-1].message.endswith("left: 50 frames; right: 40 frames, 2 left out, the disk is full")
 
 
-def test_a_vision_process_that_says_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_vision_process_that_states_nothing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bench = Bench(tmp_path, monkeypatch, left="frames", right="frames")
     bench.orders.begin(bench.flight)
     bench.orders.add_report(RecordedImages("right", "/elsewhere/right.avi", 9, 0, 9))
     bench.orders.end()
     bench.tell("left", 5)
-    bench.now += recordings.LAST_WORD_S + 0.1
+    bench.now += recordings.REPORT_TIMEOUT_S + 0.1
     bench.orders.poll()
     found = bench.events[-1].images
     assert found is not None
-    assert "has not said" in found.cameras[1].why
+    assert "did not report how many" in found.cameras[1].why
     assert not bench.orders.running
 
 
@@ -118,7 +120,7 @@ def test_cameras_without_pictures_are_refused_with_the_reason(tmp_path: Path, mo
     assert Bench(tmp_path, monkeypatch, left="frames").ordered() is None, "of a gateway that has died"
 
 
-def test_a_cell_that_says_nothing_keeps_ten_minutes_in_half_a_gibibyte_and_four_faults(
+def test_a_cell_that_states_nothing_keeps_ten_minutes_in_half_a_gibibyte_and_four_faults(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made: list[tuple[Path, RingLimits]] = []
@@ -192,8 +194,8 @@ def test_a_full_disk_ends_a_recording_and_the_next_request_begins_another(
     )  # fmt: skip
     (tmp_path / "run").mkdir()
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
-    notes = KeeperNotes(log)
-    flight = Recordings(plan, log, notes.tell)
+    notes = OperatorNotes(log)
+    flight = Recordings(plan, log, notes.set_note)
     begin = RecordingStart(Settings(250.0), fingerprint())  # type: ignore[arg-type]
 
     def stream(first: int) -> None:
@@ -229,7 +231,7 @@ def test_a_ring_that_is_not_written_is_a_note_until_it_is(tmp_path: Path, monkey
     rings: list[SimpleNamespace] = []
 
     def ring(*_: object) -> SimpleNamespace:
-        rings.append(SimpleNamespace(said=deque(), trouble="", take=lambda _: None, close=lambda: None))
+        rings.append(SimpleNamespace(reports=deque(), trouble="", take=lambda _: None, close=lambda: None))
         return rings[-1]
 
     monkeypatch.setattr(recordings, "RingThread", ring)
@@ -240,16 +242,16 @@ def test_a_ring_that_is_not_written_is_a_note_until_it_is(tmp_path: Path, monkey
     )  # fmt: skip
     events: list[EventMessage] = []
     log = EventLog("boot", lambda payload: events.append(decode(payload, EventMessage)))
-    notes = KeeperNotes(log)
-    flight = Recordings(plan, log, notes.tell)
+    notes = OperatorNotes(log)
+    flight = Recordings(plan, log, notes.set_note)
     (one,) = rings
-    one.said.append(("warning", "the flight ring is not written: No space left"))
+    one.reports.append(("warning", "the flight ring is not written: No space left"))
     one.trouble = "No space left"
     for _ in range(3):
         flight.poll()
     assert notes.texts == ("the flight ring is not written: No space left",)
     one.trouble = ""
-    one.said.append(("ring_kept", "kept"))
+    one.reports.append(("ring_kept", "kept"))
     flight.poll()
     assert notes.texts == ()
     assert [event.kind for event in events] == ["warning", "ring_kept"]

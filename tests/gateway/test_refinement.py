@@ -64,8 +64,8 @@ class Bench:
 
     def run(self, seconds: float, *, moves: bool = False) -> None:
         """States at 20 Hz, frames at 33 Hz."""
-        take_state = getattr(self.into, "take_state", getattr(self.into, "add_state", None))
-        take_frame = getattr(self.into, "take_frame", getattr(self.into, "add_frame", None))
+        add_state = getattr(self.into, "on_state", getattr(self.into, "add_state", None))
+        add_frame = self.into.add_frame
         end = self.t_ns + round(1e9 * seconds)
         while self.t_ns < end:
             self.t_ns += 10_000_000
@@ -74,14 +74,14 @@ class Bench:
                 for camera in self.settings.cameras:
                     ids = np.array(camera.marker_ids[:4])
                     pixels = 100.0 + 10.0 * ids[:, None] + 50.0 * self.q[:2]
-                    take_frame(
+                    add_frame(
                         CameraObservation(
                             camera.name, self.seq, self.t_ns, self.t_ns + 1, ids, pixels,
                             np.tile(0.01 * np.eye(2), (len(ids), 1, 1)),
                         )
                     )  # fmt: skip
             if self.t_ns % STATE_NS == 0:
-                take_state(self.status(moves))
+                add_state(self.status(moves))
 
     def visit(self, q: np.ndarray) -> None:
         """Go there, and stand for a second."""
@@ -374,7 +374,7 @@ def test_goals_that_cannot_be_stored_at_the_next_start_are_good_in_memory(
     for _ in range(2):
         gateway.jobs.poll()
     assert gateway.models.epochs() == [1, 2]
-    gateway.taught.put_back(before)  # as if the crash had been before this file
+    gateway.taught.restore_goals(before)  # as if the crash had been before this file
     with monkeypatch.context() as patch:
         patch.setattr(persistence, "save_taught", _disk_is_full)
         started = NextStart(gateway, folder)
@@ -382,7 +382,7 @@ def test_goals_that_cannot_be_stored_at_the_next_start_are_good_in_memory(
     assert "No space left" in started.told[0].message
     assert NextStart(gateway, folder).told == []
     assert TaughtStore(folder / "taught.json").goals["park"].target.model_epoch == 2
-    gateway.taught.put_back(before)
+    gateway.taught.restore_goals(before)
     gateway.models.path(1).unlink()
     started = NextStart(gateway, folder)
     assert started.taught.goals == before
@@ -431,7 +431,7 @@ class NextStart:
         jobs = RefinementJobs(
             before.settings, False, models, link, log, self.calibration, link, self.taught, RunningGoals
         )
-        jobs.complete_hand_over()
+        jobs.complete_replacement()
 
 
 def test_poses_after_a_verdict_are_judged_as_the_first_ones_were(

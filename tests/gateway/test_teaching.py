@@ -74,7 +74,7 @@ def test_a_goal_is_stored_with_the_tool_of_its_request(bench: Bench) -> None:
     assert bench.said() == []
 
 
-def test_a_tool_that_was_not_seen_teaches_nothing_and_is_told(bench: Bench) -> None:
+def test_a_tool_that_was_not_seen_teaches_nothing_and_is_reported(bench: Bench) -> None:
     bench.teaching.expect(7, (20, 21, 99))
     bench.taught(placed(BODY | TOOL, HAND))
     bench.model = None
@@ -98,7 +98,7 @@ def test_what_is_seen_now_carries_a_goal_over(bench: Bench) -> None:
             assert pixel == pytest.approx(tuple(truth[camera][marker]), abs=1e-4)
 
 
-def test_a_drawn_goal_is_stored_and_told(bench: Bench, tmp_path: Path) -> None:
+def test_a_drawn_goal_is_stored_and_reported(bench: Bench, tmp_path: Path) -> None:
     bench.show(placed(WORK, TABLE))
     message = bench.teaching.synthesise(Synthesise("pick", dict(WORK), dict(BODY)))
     assert "made from drawings: drawing placed by 6 markers" in message
@@ -130,7 +130,7 @@ def test_standing_markers_of_an_incidence_become_their_pixels_of_now(bench: Benc
         assert sorted(seen[camera]) == [10, 11, 12]
 
 
-def test_a_goal_that_cannot_be_written_is_told(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_that_cannot_be_written_is_reported(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(name: str, goal: Any) -> None:
         raise OSError(28, "No space left on device")
 

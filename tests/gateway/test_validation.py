@@ -112,12 +112,12 @@ def test_good_goals_have_no_problem() -> None:
         ),
     ],
 )
-def test_each_problem_says_what_would_have_been_valid(target: Any, options: dict[str, Any], expected: str) -> None:
+def test_each_problem_states_what_would_have_been_valid(target: Any, options: dict[str, Any], expected: str) -> None:
     (problem,) = problems(target, **options)
     assert expected in problem
 
 
-def test_all_problems_are_told_at_once() -> None:
+def test_all_problems_are_reported_at_once() -> None:
     assert len(problems(FeatureTarget({"left": {9: (1.0, 1.0), 0: (-5.0, 1.0)}, "up": GOOD}))) == 3
 
 

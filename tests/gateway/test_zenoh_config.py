@@ -255,7 +255,7 @@ def test_a_clients_tls_files_are_looked_for_before_it_connects(tmp_path: Path) -
     assert tls["connect_private_key"] == str(tmp_path / "key.pem")
 
 
-def test_an_endpoint_is_told_without_a_password() -> None:
+def test_an_endpoint_is_reported_without_a_password() -> None:
     with pytest.raises(SessionError, match="valid are unixsock-stream") as caught:
         gateway_config(cell(endpoints=["tls/operator:Tulpe@router:7447"]), Path("/"), SOCKET)
     assert "Tulpe" not in str(caught.value)

@@ -110,7 +110,7 @@ def test_without_noise_the_map_is_exact_from_as_few_points_as_it_needs(make_rig,
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_errors_of_carried_set_points_are_as_first_order_says(make_rig, family):
+def test_errors_of_carried_set_points_are_as_first_order_theory(make_rig, family):
     total = []
     for seed in range(60):
         rng = np.random.default_rng(1000 + seed)

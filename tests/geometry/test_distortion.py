@@ -11,7 +11,7 @@ from stereoservo.geometry.distortion import (
     distortion_jacobian,
     fold_radius,
     lens_jacobian,
-    straight_lens,
+    pinhole_lens,
     terms_jacobian,
     undistort,
 )
@@ -25,7 +25,7 @@ def grid(step=40):
 
 
 def test_a_straight_lens_changes_nothing():
-    lens = straight_lens(WIDTH, HEIGHT)
+    lens = pinhole_lens(WIDTH, HEIGHT)
     np.testing.assert_array_equal(distort(lens, grid()), grid())
     np.testing.assert_array_equal(undistort(lens, grid()), grid())
     np.testing.assert_allclose(lens[1:3], [319.5, 239.5])

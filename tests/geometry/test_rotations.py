@@ -260,7 +260,7 @@ def test_exact_pixels_give_the_exact_generator(rig):
     assert np.allclose(rotation_from_parameters(found.parameters, found.chart), found.generator)
 
 
-def test_fits_reach_the_cramer_rao_bound_and_say_so(rig):
+def test_fits_reach_the_cramer_rao_bound_and_state_it(rig):
     """Normalised squared errors of the generator, and costs, pooled over 60 seeds: chi-square at 1 %."""
     sigma, runs = 0.3, 60
     normalised, cost, freedom = 0.0, 0.0, 0

@@ -312,7 +312,7 @@ def test_plane_at_infinity_is_at_the_bound_and_its_covariance_is_right(motions):
     assert within_chi2(costs, freedom)
 
 
-def test_free_points_are_better_than_points_a_priori_and_say_so():
+def test_free_points_are_better_than_points_a_priori_and_state_it():
     ratios = []
     for seed in range(20):
         rng = np.random.default_rng(seed)
@@ -380,11 +380,11 @@ def test_thirty_percent_bad_motions_are_left_out_and_good_ones_kept():
         used_bad += int(found.used[:bad].sum())
         rejected_good += int((~found.used[bad:]).sum())
         scores.append(plane_score(found.fit, scene.plane))
-        for judgement, use in zip(found.judgements, found.used, strict=True):
+        for judgement, use in zip(found.tests, found.used, strict=True):
             assert (judgement.reason == "") == bool(use)
-        good = [j for j, use in zip(found.judgements, found.used, strict=True) if use]
+        good = [j for j, use in zip(found.tests, found.used, strict=True) if use]
         assert all(j.conditioning >= j.least_conditioning for j in good)
-        assert found.judgements[1].reason == "points"
+        assert found.tests[1].reason == "points"
     assert used_bad == 0
     # Three tests of a thousandth each a good motion, one more for the plane.
     assert rejected_good <= binom.isf(1e-4, runs * (motions - bad), 4e-3)
@@ -403,9 +403,9 @@ def test_bad_motions_of_one_kind_that_agree_on_a_wrong_plane_are_named():
         m = np.einsum("cij,nj->cni", scene.Ps, points @ (np.eye(4) + np.outer(k, other)).T)
         exact[s + 1] = m[..., :2] / m[..., 2:]
     found = estimate_translations(scene.Ps, exact + 0.02 * rng.normal(size=exact.shape), 0.02)
-    assert [j.reason for j in found.judgements[:3]] == ["other_plane"] * 3
+    assert [j.reason for j in found.tests[:3]] == ["other_plane"] * 3
     assert found.used[3:].all()
-    assert min(j.distance for j in found.judgements[:3]) > chi2.isf(1e-3, 3)
+    assert min(j.distance for j in found.tests[:3]) > chi2.isf(1e-3, 3)
 
 
 def test_without_rejection_a_bad_motion_spoils_the_estimate():
@@ -479,7 +479,7 @@ def test_the_affine_upgrade_makes_parallels_of_parallels():
     assert np.abs(design @ map_ - scene.X).max() < 1e-8  # an affinity maps it to the truth
 
 
-def test_two_motions_of_which_one_is_bad_cannot_be_told_apart():
+def test_two_motions_of_which_one_is_bad_cannot_be_distinguished():
     rng = np.random.default_rng(7)
     scene, shifts = Scene(rng), shifts_of(rng, 2)
     exact = scene.pixels(scene.moved(shifts))
@@ -512,7 +512,7 @@ def test_coplanar_points_without_noise_are_exact_and_their_bad_motions_are_left_
     spoil(rng, scene, exact, 2, "matches", shifts[1])
     found = estimate_translations(scene.Ps, exact + 0.05 * rng.normal(size=exact.shape), 0.05)
     assert found.used.tolist() == [False, False, True, True, True, True]
-    assert [j.reason for j in found.judgements[:2]] == ["not_a_translation", "points"]
+    assert [j.reason for j in found.tests[:2]] == ["not_a_translation", "points"]
 
 
 def test_coplanar_points_moved_within_their_plane_or_little_out_of_it_are_refused():

@@ -112,7 +112,7 @@ def test_a_gateway_that_dies_and_finds_its_files_damaged_goes_on(
 
     eventually("the gateway is back", back, 60.0)
     with Client(CELL) as client:
-        assert any("handled.slot: was damaged and begins anew" in note for note in client.status().notes)
+        assert any("handled.slot: was damaged and is started empty" in note for note in client.status().notes)
 
         def told(words: str) -> bool:
             return any(words in event.message for event in client.events().events if event.kind == "warning")

@@ -97,7 +97,7 @@ def test_metric_quantities_are_the_cells():
         assert told == pytest.approx(np.linalg.norm(cell.body[i] - cell.body[0]))
 
 
-def test_nearly_parallel_axes_are_told_by_two_angles_with_signs():
+def test_nearly_parallel_axes_are_reported_by_two_angles_with_signs():
     cell = synthetic.rx90()
     found = values(exact_model(cell))
     assert found["angle of axes j2 j3 about their normal"] == pytest.approx(0.0, abs=1e-9)
@@ -138,7 +138,7 @@ def test_a_scara_knows_its_links_and_heights():
         ("parallel", {"plane at infinity": "j1, j2, j3 are parallel", "intrinsics and vergence": "parallel"}),
     ],
 )
-def test_what_is_not_identifiable_is_told_with_the_reason(name, told):
+def test_what_is_not_identifiable_is_reported_with_the_reason(name, told):
     rows = gauge_free_quantities(exact_model(getattr(synthetic, name)(), stratum=STRATA[name]))
     missing = {row.name: row.reason for row in rows if row.value is None}
     for key, reason in told.items():

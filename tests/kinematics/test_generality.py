@@ -10,7 +10,7 @@ from scipy.stats import chi2
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.covariance import propagate_covariance
 from stereoservo.kinematics.denavit_hartenberg import COLUMNS, ReadOutError, denavit_hartenberg
 from stereoservo.kinematics.gauge_free import gauge_free_quantities
 from stereoservo.messages.known_length import KnownLength
@@ -121,7 +121,7 @@ def test_stratum_and_noise_floor(fitted):
 def test_poses_that_were_not_seen_are_predicted_within_the_covariance(fitted):
     """All joints at once, which no trial moved together."""
     positions = fitted.cell.held_out(fitted.rng, 8)
-    predicted, covariance = propagated(fitted.model, pixels_at(positions))
+    predicted, covariance = propagate_covariance(fitted.model, pixels_at(positions))
     assert_consistent(predicted - fitted.cell.pixels(positions).ravel(), covariance)
     assert np.sqrt(np.diag(covariance)).max() < 20 * SIGMA
 

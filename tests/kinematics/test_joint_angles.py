@@ -15,11 +15,11 @@ from stereoservo.kinematics.joint_angles import (
 )
 from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
-    SeenChain,
+    ObservedChain,
     joint_problem,
     pinhole_lenses,
-    points_seen,
     predicted_pixels,
+    reconstruct_points,
 )
 from stereoservo_sim.world import synthetic
 
@@ -111,7 +111,7 @@ def test_the_self_motion_of_seven_joints_is_named(perfect_calibration):
     assert "j4" not in error.value.data["joints"]
 
 
-def test_all_eight_configurations_of_a_wrist_arm_are_told_apart(perfect_calibration):
+def test_all_eight_configurations_of_a_wrist_arm_are_distinguished(perfect_calibration):
     """Shoulder, elbow and wrist, two ways each: an arm with a spherical wrist reaches a pose in eight ways."""
     cell = synthetic.rx90()
     seen, points = perfect_calibration(cell, 5)
@@ -171,7 +171,7 @@ def test_one_camera_and_one_point_may_leave_several_answers(perfect_calibration)
     """Two numbers for two joints: every solution of the two equations is told, each exact."""
     cell = synthetic.pan_tilt()
     seen, points = perfect_calibration(cell, 8)
-    one = SeenChain(seen.chain, seen.cameras[:1], seen.lenses[:1], seen.joint_names)
+    one = ObservedChain(seen.chain, seen.cameras[:1], seen.lenses[:1], seen.joint_names)
     q = cell.home + np.array([0.05, 0.06])
     pixels = cell.pixels(q[None])[:1, 0, :1]
     found = measured_joints(joint_problem(one, points[:1], pixels, 0.3))
@@ -220,7 +220,7 @@ def test_questions_that_make_no_sense_are_refused(perfect_calibration):
     with pytest.raises(JointAnglesError, match="two cameras"):
         homing_problem(seen, cell.home, few, pixels, 0.2)
     with pytest.raises(JointAnglesError, match="names"):
-        SeenChain(seen.chain, seen.cameras, pinhole_lenses(1), seen.joint_names)
+        ObservedChain(seen.chain, seen.cameras, pinhole_lenses(1), seen.joint_names)
 
 
 def test_encoder_zeros_are_reset_at_their_stated_deviation(perfect_calibration):
@@ -277,6 +277,6 @@ def test_points_seen_anywhere_are_brought_to_the_zero(perfect_calibration):
     cell = synthetic.pan_tilt().with_k1(-0.3)
     seen, points = perfect_calibration(cell, 14)
     q = cell.home + np.array([0.1, 0.1])
-    found, covariance = points_seen(seen, q, cell.pixels(q[None])[:, 0], 0.1)
+    found, covariance = reconstruct_points(seen, q, cell.pixels(q[None])[:, 0], 0.1)
     assert np.allclose(found / found[:, 3:], points / points[:, 3:], atol=1e-7)
     assert (np.linalg.eigvalsh(covariance)[:, 1:] > 0).all()

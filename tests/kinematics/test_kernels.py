@@ -158,7 +158,7 @@ def test_triangulation_is_exact_without_noise(seed, c):
     assert np.abs(M - X / (X @ Ps[0, 2])[:, None]).max() < 1e-9
 
 
-def test_rays_that_determine_nothing_are_told():
+def test_rays_that_determine_nothing_are_reported():
     _, Ps, X = random_scene(1)
     pixels = cameras.project_many(Ps, X)
     same = np.ascontiguousarray(Ps[[0, 0]])

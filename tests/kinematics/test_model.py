@@ -207,7 +207,7 @@ def test_refuses_what_is_no_json_object(data):
         decode_model(data)
 
 
-def test_says_that_a_file_is_missing(tmp_path):
+def test_states_that_a_file_is_missing(tmp_path):
     with pytest.raises(ModelFileError, match="cannot be read: No such file"):
         load_model(tmp_path / "model.json")
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, joint_zeros
-from stereoservo.kinematics.joint_reprojection import seen_chain
+from stereoservo.kinematics.joint_reprojection import observed_chain
 from stereoservo_sim.experiments.pan_tilt import feed_forward
 from stereoservo_sim.world import synthetic
 
@@ -33,7 +33,7 @@ def test_a_calibrated_head_predicts_homes_and_resets_its_zeros():
     cell = head_with(40)
     rng = np.random.default_rng(1)
     result = fit_model(cell.trials(0.1, rng, stops=11), epoch=1)
-    head = seen_chain(result.model)
+    head = observed_chain(result.model)
     assert head.chain.tip_first
     assert result.report.chi2_ok
     q = cell.held_out(rng, 6)

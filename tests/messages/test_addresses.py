@@ -141,7 +141,7 @@ def test_how_an_address_is_read_and_shown(text, shown, url):
         ("", "", "begins with no http://"),
     ],
 )
-def test_what_is_no_address_is_told_without_its_secrets(text, shown, told):
+def test_what_is_no_address_is_reported_without_its_secrets(text, shown, told):
     address = Address(text)
     assert address == shown
     with pytest.raises(AddressError) as caught:

@@ -274,7 +274,7 @@ def test_a_cell_has_limits_of_size(tmp_path: Path) -> None:
         core_settings(cell, thirteen, (CAMERA,))
 
 
-def test_a_value_that_is_refused_is_told_without_a_password() -> None:
+def test_a_value_that_is_refused_is_reported_without_a_password() -> None:
     tree = {
         "schema": 1, "cell": {"name": "x"}, "joints": {"driver": "fake"}, "camera": [{"name": "a", "driver": "fake"}],
         "safety": {}, "zenoh": {"endpoints": "tls/operator:Tulpe@router:7447"},

@@ -15,7 +15,7 @@ from stereoservo.daemon.supervisor import ProgressLines
 from stereoservo.messages import compilation_progress, discovery
 from stereoservo.messages.compilation_progress import (
     CompilationProgress,
-    PatientWait,
+    ProgressTimeout,
     progress_path,
     read_progress,
 )
@@ -50,7 +50,7 @@ def test_a_process_tells_each_kernel_that_it_compiles(tmp_path: Path, monkeypatc
     (one,) = read_progress(tmp_path, 7)
     assert (one.part, one.total) == ("first", 380)
     assert one.done == sum(len(one.overloads) for one in KERNELS.values())
-    assert f"{one.done} of about " in one.words
+    assert f"{one.done} of about " in one.text
     assert read_progress(tmp_path, 8) == ()
     progress_path(tmp_path, "rest").write_bytes(b"{")
     assert read_progress(tmp_path) == (one,)
@@ -59,7 +59,7 @@ def test_a_process_tells_each_kernel_that_it_compiles(tmp_path: Path, monkeypatc
 def test_a_wait_lasts_as_long_as_there_is_news(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [0.0]
     monkeypatch.setattr(time, "monotonic", lambda: now[0])
-    wait = PatientWait(10.0)
+    wait = ProgressTimeout(10.0)
     for second in range(100):
         now[0] = float(second)
         assert not wait.is_over(second // 9)
@@ -69,7 +69,7 @@ def test_a_wait_lasts_as_long_as_there_is_news(monkeypatch: pytest.MonkeyPatch) 
 
 def test_a_daemon_is_waited_for_while_it_compiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(discovery, "runtime_root", lambda: tmp_path)
-    monkeypatch.setattr(discovery, "TELL_EVERY_S", 0.0)
+    monkeypatch.setattr(discovery, "REPORT_EVERY_S", 0.0)
     daemon = object.__new__(discovery.DaemonProcess)
     daemon.process, daemon._log = (
         subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE),

@@ -46,6 +46,6 @@ def test_a_wildcard_put_is_not_an_operator(key: str) -> None:
         KEYS.operator_of_goal(key)
 
 
-def test_an_unknown_verb_is_told_the_known_ones() -> None:
+def test_an_unknown_verb_gets_the_known_ones() -> None:
     with pytest.raises(InvalidKeyError, match=r"'fly'; there are: stop, enable"):
         KEYS.command_of("stereoservo/v1/demo/command/fly/anna")

@@ -12,7 +12,7 @@ import pytest
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, FileLock, hardware_lock_path, holder
 
 
-def test_the_second_holder_is_told_who_holds_and_how_to_end_it(tmp_path: Path) -> None:
+def test_the_second_holder_is_reported_who_holds_and_how_to_end_it(tmp_path: Path) -> None:
     path = tmp_path / "a.lock"
     with FileLock(path, "cell 'demo'"):
         assert holder(path) == os.getpid()
@@ -88,7 +88,7 @@ def test_a_channel_is_locked_whatever_the_runtime_directories_are(tmp_path: Path
         ChannelLock(mine, "it")
 
 
-def test_channels_with_long_names_are_told_apart(tmp_path: Path) -> None:
+def test_channels_with_long_names_are_distinguished(tmp_path: Path) -> None:
     long = "channel-video-" + "x" * 150
     with ChannelLock(tmp_path / f"{long}1.lock", "one"):
         ChannelLock(tmp_path / f"{long}2.lock", "other").release()

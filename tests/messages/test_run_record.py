@@ -12,8 +12,8 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.run_record import (
     OpenGoal,
     begin_run,
+    end_cause,
     end_run,
-    how_it_ended,
     read_goals,
     read_run,
     run_is_up,
@@ -72,9 +72,9 @@ def test_a_cause_that_nobody_could_write_is_concluded(
     run_is_up(directories)
     run = read_run(directories)
     assert run is not None
-    assert "(process 7) was killed (signal 9)" in how_it_ended(run)
+    assert "(process 7) was killed (signal 9)" in end_cause(run)
     monkeypatch.setattr(run_record, "machine_start", lambda: "another")
-    assert "the computer was switched off" in how_it_ended(run)
+    assert "the computer was switched off" in end_cause(run)
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff", b'{"boot": 5}', b"[" * 50_000, b'{"goals": [{"id": 1}]}'])

@@ -64,7 +64,7 @@ def message(
     return state_message(RUN, "b", state, now_ns=NOW_NS, servo_alive=True, last_event=0)
 
 
-def test_what_is_fresh_is_told_with_its_age() -> None:
+def test_what_is_fresh_is_reported_with_its_age() -> None:
     found = message(joints_ns=NOW_NS - 4_000_000, frames_ns=BOTH)
     assert (found.joints_age_s, found.camera_age_s) == (0.004, {"fast": 0.02, "slow": 0.02})
     assert found.joints == found.velocities == found.efforts == found.following_errors == {"j1": 0.5}
@@ -82,7 +82,7 @@ def test_joints_of_drives_that_tell_nothing_are_unknown_and_do_not_move(joints_n
     assert found.command == {"j1": 0.5}, "what is commanded is known"
 
 
-def test_of_a_silent_camera_nothing_is_told_but_its_age_and_a_slow_one_is_given_its_time() -> None:
+def test_of_a_silent_camera_nothing_is_reported_but_its_age_and_a_slow_one_is_given_its_time() -> None:
     found = message(frames_ns={"fast": NOW_NS - 1_000_000_000, "slow": NOW_NS - 1_000_000_000})
     assert silence_limit_s(30.0) < 1.0 < silence_limit_s(1.0)
     assert set(found.visible) == set(found.innovation_px) == set(found.health.cameras) == {"slow"}

@@ -116,7 +116,7 @@ def test_whatever_the_bytes_are_they_are_refused(payload: bytes) -> None:
         read(payload, Reply)
 
 
-def test_a_refusal_says_what_is_wrong_with_the_bytes() -> None:
+def test_a_refusal_states_what_is_wrong_with_the_bytes() -> None:
     with pytest.raises(MessageError, match="not UTF-8: invalid start byte 0xff"):
         decode(b'{"id":"\xff"}', Goal)
     with pytest.raises(MessageError, match="nested too deeply"):
@@ -162,7 +162,7 @@ def test_require_finite_looks_everywhere() -> None:
         require_finite({"a": [1, {"b": (math.nan,)}]})
 
 
-def test_every_schema_is_a_json_schema_and_unknown_ones_are_told_the_known() -> None:
+def test_every_schema_is_a_json_schema_and_unknown_ones_get_the_known() -> None:
     for name in SCHEMAS:
         tree = msgspec.json.decode(schema(name, ("stereo",)))
         assert "$defs" in tree
@@ -232,7 +232,7 @@ def test_a_plan_survives_the_wire_and_old_readers_do_without() -> None:
     assert msgspec.json.decode(b'{"accepted": true}', type=Reply).plan is None
 
 
-def test_commands_about_goals_are_told_apart_by_their_tag() -> None:
+def test_commands_about_goals_are_distinguished_by_their_tag() -> None:
     set_points = {"kind": "features", "set_points": {"left": {"3": [1.5, 2.5]}}}
     update = decode_command("update", msgspec.json.encode({"id": ID, "target": set_points, "stamp_s": 2.5}))
     assert update == UpdateGoal(ID, FeatureTarget({"left": {3: (1.5, 2.5)}}), 2.5)

@@ -106,13 +106,13 @@ def view_rooms(
     return np.asarray(rooms), np.asarray(depths)
 
 
-def joint_rooms(joints: FloatArray, position_min: FloatArray, position_max: FloatArray) -> FloatArray:
+def joint_clearances(joints: FloatArray, position_min: FloatArray, position_max: FloatArray) -> FloatArray:
     """What each joint of ``joints`` (K, n) has left to its nearer limit: (K, n), negative beyond."""
     rooms: FloatArray = np.minimum(joints - position_min, position_max - joints)
     return rooms
 
 
-def keep_out_rooms(joints: FloatArray, keep_outs: FloatArray) -> FloatArray:
+def keep_out_clearances(joints: FloatArray, keep_outs: FloatArray) -> FloatArray:
     """How far ``joints`` (K, n) are outside each box of ``keep_outs`` (k, n, 2) along its farthest joint: (K, k)."""
     below = keep_outs[None, :, :, 0] - joints[:, None, :]
     above = joints[:, None, :] - keep_outs[None, :, :, 1]

@@ -61,14 +61,14 @@ def log_displacement(H: FloatArray) -> FloatArray:
         ratio = _sine_excess(np.asarray(theta)) / np.sinc(theta / np.pi) ** 3
         near: FloatArray = odd - float(ratio) * (odd @ odd @ odd)
         return near
-    plane = _turning_plane(H, theta)
+    plane = _rotation_plane(H, theta)
     rest = np.eye(4) - plane
     G, theta = log_rotation(rest + plane @ H)
     X: FloatArray = theta * G + rest @ odd @ rest
     return X
 
 
-def _turning_plane(H: FloatArray, theta: float) -> FloatArray:
+def _rotation_plane(H: FloatArray, theta: float) -> FloatArray:
     """Projector (4, 4) of rank two onto the eigenspace of ``exp(±iθ)``, along that of 1: ``(H⁺ - I)/(cosθ - 1)``."""
     even = 0.5 * (H + np.linalg.inv(H)) - np.eye(4)
     projector: FloatArray = -even / (2.0 * np.sin(0.5 * theta) ** 2)
@@ -130,7 +130,7 @@ def screw_axis(H: FloatArray) -> FloatArray:
             raise GeometryError("degenerate", f"the motion turns by {theta:.3g} rad; it has no axis", theta=theta)
         operator = X @ X
     else:
-        operator = _turning_plane(H, theta)
+        operator = _rotation_plane(H, theta)
     return np.ascontiguousarray(np.linalg.svd(operator)[2][2:])
 
 

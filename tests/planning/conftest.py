@@ -48,7 +48,7 @@ def plan_request(world, T_star, limits=None, centre=(0.0, 0.0, 0.0, 1.0), **opti
         "camera_centres": world.camera_centres,
         "points": world.hidden(world.markers()),
         "targets": world.hidden(_cells.PLATE @ T_star.T),
-        "kept": np.ones(4),
+        "must_stay_visible": np.ones(4),
         "centre": world.hidden(world.plate_pose() @ np.array(centre)),
         "centre_target": world.hidden(T_star @ np.array(centre)),
         "faces": np.array([[0, 1, 2]]),
@@ -83,20 +83,20 @@ def door(rng):
     return _cells.World(generators, START, _cells.random_frame(rng), np.zeros(1))
 
 
-def rooms_of(world, T):
-    """Distance from the borders [px] and cosine of sight, the least of both cameras, for a plate at ``T``."""
+def clearances_of(world, T):
+    """Distance from the borders [px] and cosine of elevation, the least of both cameras, for a plate at ``T``."""
     uv = world.pixels(_cells.PLATE @ T.T)
     inside = min(uv.min(), (640 - uv[..., 0]).min(), (480 - uv[..., 1]).min())
     return inside, world.front_facing(T).min()
 
 
-def goal_nearby(rng, world, step, room=10.0, sight=0.2):
+def goal_nearby(rng, world, step, clearance=10.0, elevation=0.2):
     """Joints within ``step`` of the present ones, and the plate's pose there, well in view."""
     while True:
         q = world.q + rng.uniform(-step, step, len(world.q))
         T = world.plate_pose(q)
-        inside, front = rooms_of(world, T)
-        if inside > room and front > sight:
+        inside, front = clearances_of(world, T)
+        if inside > clearance and front > elevation:
             return q, T
 
 
@@ -105,7 +105,7 @@ def border_task(rng):
     probe = _cells.World(np.zeros((0, 4, 4)), np.eye(4), np.eye(4), np.zeros(0))
 
     def fits(T):
-        inside, front = rooms_of(probe, T)
+        inside, front = clearances_of(probe, T)
         return 1.5 < inside < 25.0 and front > np.cos(np.radians(82))
 
     def direction():
@@ -137,7 +137,7 @@ def cells():
         door=door,
         goal_nearby=goal_nearby,
         border_task=border_task,
-        rooms_of=rooms_of,
+        clearances_of=clearances_of,
         SIZES=SIZES,
         PINHOLES=PINHOLES,
         START=START,

@@ -5,10 +5,10 @@ import pytest
 
 from stereoservo.planning.path_ik import (
     Arm,
-    Following,
+    CandidatePath,
+    FollowSettings,
     PathRecord,
     SampleRange,
-    Way,
     follow_path,
     freedoms,
     reach,
@@ -23,7 +23,7 @@ def along(planning, samples, tolerance=2.0):
     p, n = planning, len(planning.joints)
     arm = Arm(0, p.start_operators.copy(), p.joints.copy(), np.eye(4), np.zeros(n))
     record = PathRecord(np.zeros((samples, n)), np.zeros((samples, 4, 4)), empty_table())
-    way, following = Way(0, p.path, p.residual, p.joint_step), Following(False, tolerance)
+    way, following = CandidatePath(0, p.path, p.residual, p.joint_step), FollowSettings(False, tolerance)
     return follow_path(way, SampleRange(0, samples), p.constraints, arm, following, record)
 
 
@@ -38,7 +38,7 @@ def test_too_few_samples_are_noticed_between_them(virtual, cells):
 
 
 @pytest.mark.parametrize("seed", [1, 2, 4])
-def test_past_a_wrist_singularity_the_body_stays_on_its_way(virtual, cells, seed):
+def test_past_a_wrist_singularity_the_body_stays_on_its_path(virtual, cells, seed):
     """The fifth joint changes its sign: joints run, yet between the samples the body is where the plan says."""
     rng = np.random.default_rng(seed)
     q = virtual.RX90_MIDDLE.copy()

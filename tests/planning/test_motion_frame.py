@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from stereoservo.planning.motion_frame import motion_frame, plane_at_infinity, turn, turn_between
+from stereoservo.planning.motion_frame import axis_rotation, motion_frame, plane_at_infinity, rotation_between
 
 
 @pytest.mark.parametrize("make", ["free", "rx90", "seven", "five", "scara", "door", "gantry"])
@@ -59,7 +59,7 @@ def test_rotation_between_point_sets(seed, angle, flat):
     axis /= np.linalg.norm(axis)
     X = rng.normal(size=(5, 3)) * ([1, 1, 0] if flat else [1, 1, 1])
     R = Rotation.from_rotvec(angle * axis)
-    np.testing.assert_allclose(turn(axis, angle), R.as_matrix(), atol=1e-14)
-    found = turn_between(X, R.apply(X) + rng.normal(size=3))
+    np.testing.assert_allclose(axis_rotation(axis, angle), R.as_matrix(), atol=1e-14)
+    found = rotation_between(X, R.apply(X) + rng.normal(size=3))
     assert 0 <= found[3] <= np.pi + 1e-12
-    np.testing.assert_allclose(turn(found[:3].copy(), found[3]), R.as_matrix(), atol=1e-6)
+    np.testing.assert_allclose(axis_rotation(found[:3].copy(), found[3]), R.as_matrix(), atol=1e-6)

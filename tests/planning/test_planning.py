@@ -5,34 +5,34 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from oracles.path_visibility import joint_rooms, keep_out_rooms
+from oracles.path_visibility import joint_clearances, keep_out_clearances
 from stereoservo.core.cycle import decode_array, encode_array
 from stereoservo.kinematics.composition import Composition
 from stereoservo.planning.path_search import sample_times
 from stereoservo.planning.planner import (
     MISSING_FREEDOMS,
-    Planning,
+    PlanningState,
     PlanRequestError,
+    continue_planning,
     plan,
-    plan_on,
     start_planning,
 )
 from stereoservo.planning.primitives import TRANSLATION
 
 
-def dense_rooms(virtual, cells, world, joints, count=400):
+def dense_clearances(virtual, cells, world, joints, count=400):
     """Least distance from the borders [px] and least elevation [deg] on the way, by the Euclidean truth."""
     s = np.linspace(0, 1, len(joints))
-    rooms, sights = [], []
+    clearances, elevations = [], []
     for x in np.linspace(0, 1, count):
         q = np.array([np.interp(x, s, column) for column in joints.T])
         T = world.plate_pose(q)
         uv = world.pixels(virtual.PLATE @ T.T)
-        rooms.append(min(uv.min() + 0.5, (639.5 - uv[..., 0]).min(), (479.5 - uv[..., 1]).min()))
+        clearances.append(min(uv.min() + 0.5, (639.5 - uv[..., 0]).min(), (479.5 - uv[..., 1]).min()))
         middle = T @ np.append(virtual.PLATE[:3, :3].mean(axis=0), 1.0)
         way = world.eyes[:, :3] - middle[:3]
-        sights.append(np.degrees(np.arcsin(-way @ T[:3, 2] / np.linalg.norm(way, axis=1))).min())
-    return min(rooms), min(sights)
+        elevations.append(np.degrees(np.arcsin(-way @ T[:3, 2] / np.linalg.norm(way, axis=1))).min())
+    return min(clearances), min(elevations)
 
 
 def check_ends(virtual, world, found, T_star):
@@ -48,41 +48,41 @@ def check_ends(virtual, world, found, T_star):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_straight_ways_are_straight_and_tell_their_approaches(virtual, cells, seed):
+def test_straight_paths_are_straight_and_tell_their_approaches(virtual, cells, seed):
     rng = np.random.default_rng(seed)
     T0, T_star = virtual.random_task(rng, rng.uniform(5, 150), rng.uniform(0.02, 0.4))
     world = virtual.free_arm(rng, T0)
     request = cells.request(world, T_star)
     found = plan(request).plan
     assert found is not None
-    assert found.way == "linear"
+    assert found.description == "linear"
     check_ends(virtual, world, found, T_star)
     # the centre's way and the angle grow evenly
     poses = np.array([world.plate_pose(q) for q in found.joints])
-    line = T0[:3, 3] + found.shares[:, None] * (T_star[:3, 3] - T0[:3, 3])
+    line = T0[:3, 3] + found.path_parameters[:, None] * (T_star[:3, 3] - T0[:3, 3])
     np.testing.assert_allclose(poses[:, :3, 3], line, atol=1e-6)
-    room, sight = dense_rooms(virtual, cells, world, found.joints)
-    told = {approach.what: approach for approach in found.approaches}
-    assert told["FIELD_OF_VIEW"].value == pytest.approx(room, abs=0.5)
-    assert told["FACE_HIDDEN"].value == pytest.approx(sight, abs=0.3)
+    clearance, elevation = dense_clearances(virtual, cells, world, found.joints)
+    closest = {approach.kind: approach for approach in found.approaches}
+    assert closest["FIELD_OF_VIEW"].value == pytest.approx(clearance, abs=0.5)
+    assert closest["FACE_HIDDEN"].value == pytest.approx(elevation, abs=0.3)
     limits = request.limits
-    rooms = joint_rooms(found.joints, limits.position_min, limits.position_max)
-    assert told["JOINT_LIMIT"].room == pytest.approx(rooms.min())
-    assert told["JOINT_LIMIT"].index == np.unravel_index(rooms.argmin(), rooms.shape)[1]
-    assert all(approach.room >= 0 for approach in found.approaches)
+    clearances = joint_clearances(found.joints, limits.position_min, limits.position_max)
+    assert closest["JOINT_LIMIT"].clearance == pytest.approx(clearances.min())
+    assert closest["JOINT_LIMIT"].index == np.unravel_index(clearances.argmin(), clearances.shape)[1]
+    assert all(approach.clearance >= 0 for approach in found.approaches)
     expected = sample_times(found.joints, limits.velocity_max, limits.acceleration_max, False)
     np.testing.assert_array_equal(found.times, expected)
 
 
 @pytest.mark.slow
-def test_straight_ways_suffice_for_a_thousand_tasks(virtual, cells):
+def test_straight_paths_suffice_for_a_thousand_tasks(virtual, cells):
     rng = np.random.default_rng(100)
     straight = 0
     for _ in range(1000):
         T0, T_star = virtual.random_task(rng, rng.uniform(5, 150), rng.uniform(0.02, 0.4))
         found = plan(cells.request(virtual.free_arm(rng, T0), T_star)).plan
         assert found is not None
-        straight += found.way == "linear"
+        straight += found.description == "linear"
     assert straight >= 990
 
 
@@ -137,9 +137,9 @@ def test_a_goal_beyond_the_arms_freedoms_names_what_is_missing(virtual, cells, m
     done = plan(cells.request(world, T_star))
     assert done.plan is None
     failure = done.failure[0]
-    assert failure.what == "NOT_REACHABLE"
+    assert failure.kind == "NOT_REACHABLE"
     assert failure.value > failure.limit
-    assert failure.share == 1.0
+    assert failure.path_parameter == 1.0
     named = MISSING_FREEDOMS[failure.index]
     assert named == missing if missing else named != TRANSLATION
 
@@ -158,10 +158,10 @@ def test_self_motion_keeps_a_redundant_arm_off_its_limits(virtual, cells):
     assert found is not None
     assert free is not None
     check_ends(virtual, world, found, T_star)
-    room = joint_rooms(found.joints, middle - half, middle + half)
+    clearance = joint_clearances(found.joints, middle - half, middle + half)
     # it starts with a tenth of a radian and moves away, where the least motion would not
-    assert room[0].min() == pytest.approx(0.1)
-    assert room[-1].min() > joint_rooms(free.joints, middle - half, middle + half)[-1].min() + 0.02
+    assert clearance[0].min() == pytest.approx(0.1)
+    assert clearance[-1].min() > joint_clearances(free.joints, middle - half, middle + half)[-1].min() + 0.02
 
 
 def test_out_of_view_goals_and_starts_are_refused_at_their_end(virtual, cells):
@@ -170,15 +170,15 @@ def test_out_of_view_goals_and_starts_are_refused_at_their_end(virtual, cells):
     outside = T_star.copy()
     outside[:3, 3] = [0.6, 0.0, 1.0]
     failure = start_planning(cells.request(virtual.free_arm(rng, T0), outside)).failure[0]
-    assert (failure.what, failure.share) == ("FIELD_OF_VIEW", 1.0)
-    assert failure.room < 0
+    assert (failure.kind, failure.path_parameter) == ("FIELD_OF_VIEW", 1.0)
+    assert failure.clearance < 0
     world = virtual.free_arm(rng, outside)
     failure = start_planning(cells.request(world, T_star)).failure[0]
-    assert (failure.what, failure.share) == ("FIELD_OF_VIEW", 0.0)
+    assert (failure.kind, failure.path_parameter) == ("FIELD_OF_VIEW", 0.0)
     uv = world.pixels(world.markers())
-    rooms = np.minimum(uv + 0.5, cells.SIZES[:, None] - 0.5 - uv).min(axis=-1)
-    assert failure.value == pytest.approx(max(rooms.min(), -640.0))
-    assert (failure.index, failure.marker) == np.unravel_index(rooms.argmin(), rooms.shape)
+    clearances = np.minimum(uv + 0.5, cells.SIZES[:, None] - 0.5 - uv).min(axis=-1)
+    assert failure.value == pytest.approx(max(clearances.min(), -640.0))
+    assert (failure.index, failure.marker) == np.unravel_index(clearances.argmin(), clearances.shape)
 
 
 def test_goals_behind_a_camera_or_with_the_back_to_it_are_refused(virtual, cells):
@@ -188,11 +188,11 @@ def test_goals_behind_a_camera_or_with_the_back_to_it_are_refused(virtual, cells
     behind = T_star.copy()
     behind[2, 3] = -1.0
     failure = start_planning(cells.request(world, behind)).failure[0]
-    assert (failure.what, failure.share) == ("BEHIND_CAMERA", 1.0)
+    assert (failure.kind, failure.path_parameter) == ("BEHIND_CAMERA", 1.0)
     back = virtual.pose(Rotation.from_euler("x", 180, degrees=True), [0, 0, 1.0])
     front = virtual.pose(Rotation.identity(), [0, 0, 1.0])
     failure = start_planning(cells.request(virtual.free_arm(rng, front), back)).failure[0]
-    assert (failure.what, failure.share) == ("FACE_HIDDEN", 1.0)
+    assert (failure.kind, failure.path_parameter) == ("FACE_HIDDEN", 1.0)
     assert failure.value < 0
 
 
@@ -201,7 +201,10 @@ def test_markers_that_need_not_be_seen_may_leave(virtual, cells):
     T0, T_star = virtual.random_task(rng, 30, 0.1)
     T_star[:3, 3] = [0.6, 0.0, 1.0]
     world = virtual.free_arm(rng, T0)
-    assert plan(cells.request(world, T_star, kept=np.zeros(4), faces=np.zeros((0, 3), dtype=np.int64))).plan is not None
+    assert (
+        plan(cells.request(world, T_star, must_stay_visible=np.zeros(4), faces=np.zeros((0, 3), dtype=np.int64))).plan
+        is not None
+    )
 
 
 def test_joint_limits_and_keep_outs_fail_where_they_are_met(virtual, cells):
@@ -214,20 +217,20 @@ def test_joint_limits_and_keep_outs_fail_where_they_are_met(virtual, cells):
     beyond = plan(cells.request(world, T_star, limits={"position_max": upper}))
     assert beyond.plan is None
     at_goal, on_way = beyond.failure[0], beyond.failure[1]
-    assert (at_goal.what, at_goal.index, at_goal.share, at_goal.unit) == ("JOINT_LIMIT", 0, 1.0, "m")
-    assert at_goal.room == pytest.approx(-0.05, abs=1e-6)
-    assert on_way.share == pytest.approx(0.75, abs=1.0 / 32)
+    assert (at_goal.kind, at_goal.index, at_goal.path_parameter, at_goal.unit) == ("JOINT_LIMIT", 0, 1.0, "m")
+    assert at_goal.clearance == pytest.approx(-0.05, abs=1e-6)
+    assert on_way.path_parameter == pytest.approx(0.75, abs=1.0 / 32)
     box = np.full((1, 6, 2), [-np.inf, np.inf])
     box[0, 0] = [0.08, 0.12]
     blocked = plan(cells.request(world, T_star, limits={"keep_outs": box}, bend=False))
-    assert (blocked.failure[0].what, blocked.failure[0].index) == ("KEEP_OUT", 0)
-    assert blocked.failure[0].share == pytest.approx(0.4, abs=1.0 / 32)
+    assert (blocked.failure[0].kind, blocked.failure[0].index) == ("KEEP_OUT", 0)
+    assert blocked.failure[0].path_parameter == pytest.approx(0.4, abs=1.0 / 32)
     # a box that leaves a way round it
     box[0, 1] = [-0.03, np.inf]
     around = plan(cells.request(world, T_star, limits={"keep_outs": box}))
     assert around.plan is not None
-    assert "bent" in around.plan.way
-    assert keep_out_rooms(around.plan.joints, box).min() >= 0
+    assert "bent" in around.plan.description
+    assert keep_out_clearances(around.plan.joints, box).min() >= 0
 
 
 def test_a_joint_beyond_its_limit_may_come_back(virtual, cells):
@@ -247,7 +250,7 @@ def test_the_present_pose_is_a_plan_of_no_duration(virtual, cells):
     assert done.plan is not None
     assert done.plan.times.tolist() == [0.0]
     np.testing.assert_array_equal(done.plan.joints, world.q[None])
-    assert {approach.what for approach in done.plan.approaches} >= {"JOINT_LIMIT", "FIELD_OF_VIEW"}
+    assert {approach.kind for approach in done.plan.approaches} >= {"JOINT_LIMIT", "FIELD_OF_VIEW"}
 
 
 @pytest.mark.parametrize("distance", [0.0, 0.2])
@@ -265,7 +268,7 @@ def test_half_turns_coplanar_faces_and_a_centre_on_target(virtual, cells, angle,
     np.testing.assert_allclose(poses[:, 2, 2], 1.0, atol=1e-9)  # the face stays in its plane
 
 
-def test_half_a_turn_about_any_axis_is_planned_with_the_face_in_sight(virtual, cells):
+def test_half_a_turn_about_any_axis_is_planned_with_the_face_visible(virtual, cells):
     rng = np.random.default_rng(2)
     for _ in range(5):
         T0, T_star = virtual.random_task(rng, 180.0, 0.2)
@@ -273,9 +276,9 @@ def test_half_a_turn_about_any_axis_is_planned_with_the_face_in_sight(virtual, c
         found = plan(cells.request(world, T_star)).plan
         assert found is not None
         check_ends(virtual, world, found, T_star)
-        room, sight = dense_rooms(virtual, cells, world, found.joints)
-        assert room > 0
-        assert sight > 2.5
+        clearance, elevation = dense_clearances(virtual, cells, world, found.joints)
+        assert clearance > 0
+        assert elevation > 2.5
 
 
 def test_measured_operators_still_end_at_the_targets(virtual, cells):
@@ -302,7 +305,7 @@ def test_slices_of_any_size_give_the_same_bits(virtual, cells):
         planning = start_planning(request)
         rounds = 0
         while not planning.finished:
-            plan_on(planning, slices)
+            continue_planning(planning, slices)
             rounds += 1
         rounds_of.append(rounds)
         same_bits(planning, whole)
@@ -317,9 +320,9 @@ def test_a_planning_that_was_stored_midway_goes_on_the_same(virtual, cells):
         whole = plan(request)
         planning = start_planning(request)
         while not planning.finished:
-            plan_on(planning, 9)
+            continue_planning(planning, 9)
             stored = msgspec.msgpack.encode(planning, enc_hook=encode_array)
-            planning = msgspec.msgpack.decode(stored, type=Planning, dec_hook=decode_array)
+            planning = msgspec.msgpack.decode(stored, type=PlanningState, dec_hook=decode_array)
         same_bits(planning, whole)
 
 
@@ -327,9 +330,9 @@ def same_bits(one, other):
     assert one.failure == other.failure
     assert (one.plan is None) == (other.plan is None)
     if one.plan is not None:
-        for name in ("times", "joints", "displacements", "shares"):
+        for name in ("times", "joints", "displacements", "path_parameters"):
             np.testing.assert_array_equal(getattr(one.plan, name), getattr(other.plan, name))
-        assert one.plan.way == other.plan.way
+        assert one.plan.description == other.plan.description
         assert one.plan.approaches == other.plan.approaches
 
 
@@ -370,7 +373,7 @@ def test_limits_that_are_none_are_refused(virtual, cells, change, match):
         start_planning(msgspec.structs.replace(request, limits=limits))
 
 
-def test_a_slower_scale_takes_longer_on_the_same_way(virtual, cells):
+def test_a_slower_scale_takes_longer_on_the_same_path(virtual, cells):
     rng = np.random.default_rng(14)
     T0, T_star = virtual.random_task(rng, 60, 0.2)
     world = virtual.rx90(rng, T0=T0)

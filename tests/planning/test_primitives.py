@@ -99,7 +99,7 @@ def scara(virtual, rng):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_deficient_arm_says_which_freedom_it_lacks(virtual, seed):
+def test_a_deficient_arm_states_which_freedom_it_lacks(virtual, seed):
     rng = np.random.default_rng(seed)
     world = scara(virtual, rng)
     X = finite(rng, 3)

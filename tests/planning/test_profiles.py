@@ -20,7 +20,7 @@ def test_monotone_from_0_to_1_and_rates_are_derivatives(shape):
     np.testing.assert_allclose((mu[2:] - mu[:-2]) / (sigma[2:] - sigma[:-2]), rates[1:-1], atol=0.03)
 
 
-def test_outside_of_the_way_it_rests():
+def test_outside_of_the_path_it_rests():
     for shape in {s for three in SHAPES.values() for s in three}:
         assert progress(shape, -0.5) == 0.0
         assert progress(shape, 1.5) == pytest.approx(1.0, abs=1e-15)

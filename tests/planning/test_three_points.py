@@ -68,9 +68,9 @@ def test_the_face_stays_visible_along_the_planned_hinge(virtual, seed, angle, di
     d, _, _ = parts(virtual, world, T0, T_star)
     inverse = np.linalg.inv(world.frame)
     for s in np.linspace(0, 1, 21):
-        turn = expm(s * d.hinge.amount * d.hinge.operator)
+        axis_rotation = expm(s * d.hinge.amount * d.hinge.operator)
         shift = np.eye(4) + s * d.translation.amount * d.translation.operator
-        assert world.front_facing(inverse @ shift @ turn @ world.frame @ T0).mean() > 0
+        assert world.front_facing(inverse @ shift @ axis_rotation @ world.frame @ T0).mean() > 0
 
 
 @pytest.mark.parametrize("tilt", [-60.0, -30.0, 30.0, 60.0])

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from oracles.path_visibility import (
     common_shares,
-    joint_rooms,
-    keep_out_rooms,
+    joint_clearances,
+    keep_out_clearances,
     rotation_bounds,
     translation_bound,
     view_rooms,
@@ -67,7 +67,7 @@ def test_rotation_bounds_hold_the_visible_angles(virtual, seed):
             assert front < 1e-9
             continue
         low, high = bounds
-        inside = any(low < theta + turn < high for turn in (-2 * np.pi, 0, 2 * np.pi))
+        inside = any(low < theta + axis_rotation < high for axis_rotation in (-2 * np.pi, 0, 2 * np.pi))
         assert inside == (front > 0) or abs(front) < 1e-9
 
 
@@ -75,7 +75,7 @@ def virtual_rotation(virtual, G, theta):
     return np.eye(4) + np.sin(theta) * G + (1 - np.cos(theta)) * G @ G
 
 
-def test_intervals_of_a_whole_way_for_both_cameras(virtual):
+def test_intervals_of_a_whole_path_for_both_cameras(virtual):
     rng = np.random.default_rng(11)
     T0, T_star = virtual.random_task(rng, 150, 0.3)
     world = virtual.free_arm(rng, T0)
@@ -122,7 +122,7 @@ def surroundings_of(world, points, lenses, cells, lower, upper, keep_outs):
     )  # fmt: skip
 
 
-def test_kernels_enter_the_least_rooms_of_the_references(virtual, cells):
+def test_kernels_enter_the_least_clearances_of_the_references(virtual, cells):
     rng = np.random.default_rng(21)
     lenses = np.array([[-0.1, 322.0, 238.0, 320.0], [0.05, 318.0, 241.0, 320.0]])
     lower, upper = np.array([-1.0, -2.0, -np.inf]), np.array([1.0, 2.0, np.inf])
@@ -134,34 +134,34 @@ def test_kernels_enter_the_least_rooms_of_the_references(virtual, cells):
         s = surroundings_of(world, X, lenses, cells, lower, upper, boxes)
         table = empty_table()
         check_view(s.body, 0.25, s, table, True)
-        rooms, depths = view_rooms(np.eye(4)[None], X, world.euclidean, lenses, cells.SIZES)
+        clearances, depths = view_rooms(np.eye(4)[None], X, world.euclidean, lenses, cells.SIZES)
         raw = np.array([distort(lens, uv) for lens, uv in zip(lenses, world.pixels(X), strict=True)])
         truth = np.minimum(raw + 0.5, cells.SIZES[:, None] - 0.5 - raw).min(axis=-1)
-        np.testing.assert_allclose(rooms[0], truth, atol=1e-9)
-        assert table[2, 1] == pytest.approx(rooms.min(), abs=1e-9)
-        assert rooms[0, int(table[2, 4]), int(table[2, 5])] == rooms.min()
+        np.testing.assert_allclose(clearances[0], truth, atol=1e-9)
+        assert table[2, 1] == pytest.approx(clearances.min(), abs=1e-9)
+        assert clearances[0, int(table[2, 4]), int(table[2, 5])] == clearances.min()
         assert table[4, 1] == pytest.approx(depths.min() - 0.05, abs=1e-12)
         centre = T[:3, 3] + (virtual.PLATE[:3, :3].mean(axis=0)) @ T[:3, :3].T
         way = world.eyes[:, :3] - centre
-        sight = np.degrees(np.arcsin(-way @ T[:3, 2] / np.linalg.norm(way, axis=1)))
-        assert table[3, 1] == pytest.approx(sight.min(), abs=1e-9)
+        elevation = np.degrees(np.arcsin(-way @ T[:3, 2] / np.linalg.norm(way, axis=1)))
+        assert table[3, 1] == pytest.approx(elevation.min(), abs=1e-9)
         q = rng.uniform(-1.5, 1.5, 3)
         check_joints(q, 0.25, s, table)
-        assert table[0, 1] == pytest.approx(np.min(joint_rooms(q[None], lower, upper)))
-        assert table[1, 1] == pytest.approx(np.min(keep_out_rooms(q[None], boxes)))
+        assert table[0, 1] == pytest.approx(np.min(joint_clearances(q[None], lower, upper)))
+        assert table[1, 1] == pytest.approx(np.min(keep_out_clearances(q[None], boxes)))
         assert (table[:5, 6] == 0.25).all()
 
 
 def test_behind_a_camera_and_beyond_the_fold_are_far_outside(virtual, cells):
     world = virtual.free_arm(np.random.default_rng(0), cells.START)
     behind = np.array([[0.0, 0, -1.0, 1.0]])
-    rooms, depths = view_rooms(np.eye(4)[None], behind, world.euclidean, cells.PINHOLES, cells.SIZES)
+    clearances, depths = view_rooms(np.eye(4)[None], behind, world.euclidean, cells.PINHOLES, cells.SIZES)
     assert (depths < 0).all()
-    assert (rooms == -640).all()
+    assert (clearances == -640).all()
     folded = np.array([[-0.3, 320.0, 240.0, 320.0]] * 2)
     wide = np.array([[3.0, 0, 1.0, 1.0]])
-    rooms, _ = view_rooms(np.eye(4)[None], wide, world.euclidean, folded, cells.SIZES)
-    assert (rooms == -640).all()
+    clearances, _ = view_rooms(np.eye(4)[None], wide, world.euclidean, folded, cells.SIZES)
+    assert (clearances == -640).all()
 
 
 def test_a_joint_in_a_keep_out_is_broken_and_named():

@@ -178,7 +178,7 @@ def test_a_full_disk_ends_the_recording_and_not_the_camera(tmp_path: Path) -> No
     bench.recorder.close()
 
 
-def test_a_directory_that_cannot_be_made_is_told(bench: Bench) -> None:
+def test_a_directory_that_cannot_be_made_is_reported(bench: Bench) -> None:
     bench.images.write_text("a file is in the way")
     bench.begin()
     bench.recorder.take([bench.frame(), bench.frame()])
@@ -209,7 +209,7 @@ def test_the_end_of_the_process_ends_the_file_whole(bench: Bench) -> None:
     assert whole(reader)
 
 
-def test_an_order_that_is_no_order_is_told_and_ignored(bench: Bench) -> None:
+def test_an_order_that_is_no_order_is_reported_and_ignored(bench: Bench) -> None:
     bench.order.write_text("{]")
     bench.look()
     bench.recorder.take([bench.frame()])
@@ -231,7 +231,7 @@ def test_two_orders_make_two_recordings(bench: Bench, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff", b"[" * 60_000, b'{"number": "one"}', b" " * 100_000])
-def test_an_order_that_cannot_be_read_is_set_aside_and_told_once(bench: Bench, data: bytes) -> None:
+def test_an_order_that_cannot_be_read_is_set_aside_and_reported_once(bench: Bench, data: bytes) -> None:
     bench.order.write_bytes(data)
     for _ in range(5):
         bench.look()

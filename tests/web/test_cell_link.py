@@ -120,7 +120,7 @@ def test_a_stop_without_an_answer_is_given_again_over_a_fresh_session(
     assert [client.stopped for client in cell.clients] == [1, 1]
 
 
-def test_where_there_is_no_daemon_the_stop_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_there_is_no_daemon_the_stop_states_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def stops() -> Reply:
         cell.gone = True
         raise NoReplyError("stop", 2.0)

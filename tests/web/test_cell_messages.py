@@ -25,7 +25,7 @@ class Cell:
     def close(self) -> None: ...
 
 
-def test_whatever_a_cell_sends_the_link_goes_on_and_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whatever_a_cell_sends_the_link_goes_on_and_states_it(monkeypatch: pytest.MonkeyPatch) -> None:
     told: list[Any] = []
     heard = Event()
 
@@ -35,7 +35,7 @@ def test_whatever_a_cell_sends_the_link_goes_on_and_says_so(monkeypatch: pytest.
             heard.set()
 
     monkeypatch.setattr(cell_link, "Client", lambda *arguments, **named: Cell())
-    monkeypatch.setattr(cell_link, "AGAIN_S", 0.01)
+    monkeypatch.setattr(cell_link, "RECONNECT_S", 0.01)
     monkeypatch.setattr(CellLink, "_read", lambda self, client: client.nothing)
     link = CellLink("far", None, "page", publish)
     link.start()
@@ -58,8 +58,8 @@ def test_a_daemon_without_the_key_of_goals_is_shown_without_them(monkeypatch: py
         raise NoReplyError("goals", 2.0)
 
     client = cast(Any, SimpleNamespace(running_goals=running_goals))
-    link._tell_goal(client, "12345678")
-    link._tell_goal(client, "")
+    link._publish_goal(client, "12345678")
+    link._publish_goal(client, "")
     assert asked == ["goals"]
     assert "goal 12345678 cannot be drawn" in told[0]["notice"]
     assert len(told) == 1
@@ -71,9 +71,7 @@ def test_a_picture_without_its_header_is_passed_over(monkeypatch: pytest.MonkeyP
     link = CellLink("far", None, "page", lambda slot, message, keep: told.append(slot))
     payload = SimpleNamespace(to_bytes=lambda: b"jpeg")
     for attachment in (None, payload):
-        link._take_picture(
-            cast(Any, SimpleNamespace(attachment=attachment, key_expr="c/preview/left", payload=payload))
-        )
+        link._on_picture(cast(Any, SimpleNamespace(attachment=attachment, key_expr="c/preview/left", payload=payload)))
     assert told == ["picture left"]
 
 
@@ -88,6 +86,6 @@ def test_how_far_the_refinement_is_comes_with_the_state(monkeypatch: pytest.Monk
         innovation_px={}, visible={}, loop=LoopInfo(250.0, 1, 0, 0, {"p99": 1.0}, {}),
     )  # fmt: skip
     for refinement in (None, RefinementState(5, 16)):
-        link._take_state(cast(Any, None), encode(msgspec.structs.replace(state, refinement=refinement)))
+        link._on_state(cast(Any, None), encode(msgspec.structs.replace(state, refinement=refinement)))
     assert [one["refinement"] for one in told] == ["", "5 rest poses, a model is estimated from 16 on"]
     assert told[1]["state"]["refinement"]["poses"] == 5

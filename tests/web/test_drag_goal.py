@@ -76,7 +76,7 @@ def test_every_depth_on_the_ray_is_seen_on_the_epipolar_line() -> None:
             assert distances.min() < 1.0, "px: a bent line is drawn by chords"
 
 
-def test_an_arm_at_its_limit_goes_as_near_as_it_can_and_says_what_is_left() -> None:
+def test_an_arm_at_its_limit_goes_as_near_as_it_can_and_states_what_is_left() -> None:
     truth = make_truth(5)
     limits = np.column_stack([BASE - 0.02, BASE + 0.02])
     found = DragModel(truth.model, limits).dragged(BASE, "left", (120.0, 0.0))

@@ -45,18 +45,18 @@ def test_a_lease_outlives_the_session_over_which_its_goal_was_sent() -> None:
     assert after.renewed == ["goal"]
 
 
-def test_what_ended_is_renewed_no_more_even_if_its_end_is_told_first_or_never() -> None:
+def test_what_ended_is_renewed_no_more_even_if_its_end_is_reported_first_or_never() -> None:
     leases = Leases(lambda: None)
     with leases.held("quick"):
-        leases.take_event(event("goal_reached", "quick"))
+        leases.on_event(event("goal_reached", "quick"))
     with pytest.raises(OSError, match="refused"), leases.held("refused"):
         raise OSError("refused")
     with leases.held("unheard"):
-        leases.take_event(event("goal_refused", "unheard", "NO_SUCH_GOAL"))
+        leases.on_event(event("goal_refused", "unheard", "NO_SUCH_GOAL"))
     with leases.held("lasting"):
         pass
     assert leases.renewed == ("unheard", "lasting"), "what is asked for now is not known yet"
-    leases.take_event(event("goal_refused", "unheard", "NO_SUCH_GOAL"))
-    leases.take_event(event("goal_refused", "lasting", "OUT_OF_VIEW"))
-    leases.take_event(event("goal_reached", "another"))
+    leases.on_event(event("goal_refused", "unheard", "NO_SUCH_GOAL"))
+    leases.on_event(event("goal_refused", "lasting", "OUT_OF_VIEW"))
+    leases.on_event(event("goal_reached", "another"))
     assert leases.renewed == ("lasting",)

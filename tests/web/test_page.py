@@ -76,16 +76,16 @@ class LiveCell:
             self.link.silent_s = 0.0
             now, now_ns = time.time(), time.monotonic_ns()
             state = msgspec.structs.replace(self.state, t_ns=now_ns, t_wall=now)
-            self._tell("info", {"info": INFO})
-            self._tell("state", {"state": state, "predicted": {}, "scene": None, "refinement": ""})
+            self._publish_slot("info", {"info": INFO})
+            self._publish_slot("state", {"state": state, "predicted": {}, "scene": None, "refinement": ""})
             for name in list(self.cameras):
                 pixels = ((30.0, 40.0), (60.0, 40.0), (60.0, 70.0))
                 seen = FeaturesMessage(name, number, now_ns, now_ns, now, (1, 2, 3), pixels, (0.1,) * 3)
-                self._tell(f"features {name}", {"features": seen})
+                self._publish_slot(f"features {name}", {"features": seen})
                 header = encode(PreviewInfo(name, number, now_ns, now, 160, 120))
                 self.link.publish(f"picture {name}", picture_message(header, JPEG), False)
 
-    def _tell(self, slot: str, tree: dict[str, Any]) -> None:
+    def _publish_slot(self, slot: str, tree: dict[str, Any]) -> None:
         self.link.publish(slot, msgspec.json.encode(tree), slot in ("info", "state"))
 
     def end(self) -> None:
@@ -214,7 +214,7 @@ def test_the_picture_of_a_dead_camera_is_grey_without_markers_and_its_age_counts
     chrome.value(f"!{OLD.format('right')} && {CAPTION.format('right')}.includes('3 markers')")
 
 
-def test_the_head_says_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrome: Browser) -> None:
+def test_the_head_states_that_the_arm_is_stopped_and_by_whom(cell: LiveCell, chrome: Browser) -> None:
     at = 1_700_000_000.0
     cell.state = msgspec.structs.replace(
         STATE,

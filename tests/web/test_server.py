@@ -143,7 +143,7 @@ def test_a_page_that_does_not_read_is_sent_no_more_pictures_until_it_has() -> No
         assert int.from_bytes(message[:4], "little") == count - 1, "the newest of all"
 
 
-def test_pages_are_told_that_the_server_lives_and_for_how_long_the_cell_has_been_silent() -> None:
+def test_pages_get_to_know_that_the_server_lives_and_for_how_long_the_cell_has_been_silent() -> None:
     with serving(None) as (port, _, _, link), connect(f"ws://127.0.0.1:{port}/socket") as page:
 
         def tick() -> dict[str, Any]:

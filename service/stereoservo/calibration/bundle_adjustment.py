@@ -23,7 +23,7 @@ from stereoservo.calibration.joint_noise import (
     stop_equations,
 )
 from stereoservo.calibration.least_squares import (
-    Determined,
+    EstimationStatistics,
     Limits,
     NormalEquations,
     RobustLoss,
@@ -90,15 +90,15 @@ class Solution:
         return self.lens_factor.without(self.charts.start(2) + np.arange(fixed))
 
     @cached_property
-    def determined(self) -> Determined:
+    def statistics(self) -> EstimationStatistics:
         """Statistics of the fit: degrees of freedom, variance, rank and covariance of the parameters."""
-        return Determined(self.cost, self.rows, self.charts.size, lambda: self.factor.dense()[:-1, :-1])
+        return EstimationStatistics(self.cost, self.rows, self.charts.size, lambda: self.factor.dense()[:-1, :-1])
 
 
-def with_joint_errors_stated(solution: Solution, noise: JointNoise) -> Solution:
+def with_joint_error_covariance(solution: Solution, noise: JointNoise) -> Solution:
     """The solution (fitted with exact joint readings) with the covariance of its parameters under joint ``noise``."""
     data = solution.data.with_joint_noise(noise)
-    factor = exact_fit_factor(solution.rig, solution.charts, data, solution.determined.triangle)
+    factor = exact_fit_factor(solution.rig, solution.charts, data, solution.statistics.triangle)
     return replace(solution, stated_factor=factor)
 
 
@@ -156,7 +156,7 @@ class _Bundle:
         make = normal_equations if state.data.joint_noise is None else stop_equations
         return make(state.rig, state.charts, state.data, weights)
 
-    def moved(self, state: _State, x: FloatArray) -> _State:
+    def retract(self, state: _State, x: FloatArray) -> _State:
         """The parameters of the charts are followed by the shared errors of stops, and each stop's own."""
         p, data = state.charts.size, state.data
         if data.joint_noise is not None:
@@ -269,10 +269,10 @@ def group_rms(squares: FloatArray, sigmas: FloatArray, variances: FloatArray) ->
 
 def generator_noise(solution: Solution) -> FloatArray:
     """Rms standard deviation (n,) of the entries of each generator, from the bundle's covariance."""
-    root = column_root(solution.determined.triangle, bounded=True)
+    root = column_root(solution.statistics.triangle, bounded=True)
     at, result = 0, []
     for generator, basis in zip(solution.rig.generators, solution.charts.generators, strict=True):
         changes = (basis @ generator - generator @ basis).reshape(len(basis), 16)
         result.append(((changes.T @ root[at : at + len(basis)]) ** 2).sum() / 16)
         at += len(basis)
-    return np.sqrt(np.array(result) * max(1.0, solution.determined.variance))
+    return np.sqrt(np.array(result) * max(1.0, solution.statistics.variance))

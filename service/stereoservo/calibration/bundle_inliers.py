@@ -11,7 +11,7 @@ import numpy as np
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.joint_noise import stop_rows
 from stereoservo.calibration.least_squares import RobustLoss
-from stereoservo.calibration.lens_estimation import FREE_LENS, lens_test, lens_wanted, straightened
+from stereoservo.calibration.lens_estimation import FREE_LENS, lens_test, required_lens_model, with_pinhole_cameras
 from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import JointErrors, Measurements, RigModel, residuals
 from stereoservo.calibration.stratum_selection import FitOptions
@@ -40,10 +40,10 @@ def projective_bundle(
         # Before any outlier is rejected: distortion makes many of them.
         here = every.corrected(robust.data.joint_errors)
         inside = here.select(inlier_mask(robust.rig, here, options))
-        wanted = lens_wanted(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
-        if wanted == lenses:
+        required = required_lens_model(solve(robust.rig, inside, "projective", lenses=lenses, max_evaluations=1))
+        if required == lenses:
             break
-        lenses = wanted
+        lenses = required
         robust = solve(robust.rig, clean, "projective", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-4)
     # With a planar target the projective bundle may have undetermined directions that the metric one determines:
     # no need to iterate along them here.
@@ -53,7 +53,7 @@ def projective_bundle(
         return solution, inliers
     if lenses == "none":
         return refine_to_convergence(solution.rig, every, "projective", options, FREE_LENS, 1e-6)
-    return refine_to_convergence(straightened(solution.rig, every), every, "projective", options, "none", 1e-6)
+    return refine_to_convergence(with_pinhole_cameras(solution.rig, every), every, "projective", options, "none", 1e-6)
 
 
 def refine_to_convergence(
@@ -160,14 +160,14 @@ def refuse_poor_fit(
                 maximum=options.max_trial_outliers,
             )
     data = every.select(inliers)
-    if solution.determined.freedom <= 0:
+    if solution.statistics.freedom <= 0:
         raise CalibrationError(
             "too_few_stops",
             f"{solution.rows} measurements for {solution.charts.size} parameters; more stops or markers are needed",
             measurements=solution.rows,
             parameters=solution.charts.size,
         )
-    factor = float(np.sqrt(solution.determined.variance))
+    factor = float(np.sqrt(solution.statistics.variance))
     if factor > options.max_sigma_factor:
         squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
         of_stop = trials.trials[data.stop]
@@ -189,7 +189,7 @@ def refuse_poor_fit(
 
 def refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
     """Raise CalibrationError for a final bundle that has undetermined directions or has not converged."""
-    rank = solution.determined.rank
+    rank = solution.statistics.rank
     because = f" ({'; '.join(notes)})" if notes else ""
     if rank < solution.charts.size:
         raise CalibrationError(
@@ -202,7 +202,7 @@ def refuse_undetermined(solution: Solution, notes: tuple[str, ...]) -> None:
         )
     if solution.converged:
         return
-    factor = solution.determined.variance
+    factor = solution.statistics.variance
     if factor < VALLEY_VARIANCE:
         raise CalibrationError(
             "not_identifiable",

@@ -17,7 +17,7 @@ from stereoservo.calibration.bundle_adjustment import (
     joint_variances,
     prediction_variances,
     residual_expectations,
-    with_joint_errors_stated,
+    with_joint_error_covariance,
 )
 from stereoservo.calibration.least_squares import chi2_within
 from stereoservo.calibration.lens_estimation import lens_test
@@ -186,19 +186,19 @@ def build_fit(
     data = every.select(inliers)
     errors = solution.residuals.reshape(-1, 2) * data.sigmas[:, None]
     squares = (errors**2).sum(axis=1) / 2
-    freedom = solution.determined.freedom
+    freedom = solution.statistics.freedom
     variances = prediction_variances(solution, every.offsets)
     own = variances[data.camera, data.stop, data.marker]
     if components is not None:
         if solution.data.joint_noise is None:
-            solution = with_joint_errors_stated(solution, components.noise(readings(every.offsets)))
+            solution = with_joint_error_covariance(solution, components.noise(readings(every.offsets)))
             variances = prediction_variances(solution, every.offsets)
         else:
             own = data.sigmas**2 * (2.0 - residual_expectations(solution))
         by_joint = joint_variances(solution, every.offsets)
-        there = _accuracy(components).deviations(every.offsets - every.corrections)
-        by_error = (by_joint * there[None, :, None] ** 2).sum(axis=3)
-        variances = variances + by_error / solution.determined.noise
+        reading_deviations = _accuracy(components).deviations(every.offsets - every.corrections)
+        by_error = (by_joint * reading_deviations[None, :, None] ** 2).sum(axis=3)
+        variances = variances + by_error / solution.statistics.noise
 
     def group(members: BoolArray) -> GroupRms:
         return group_rms(squares[members], data.sigmas[members], own[members])
@@ -217,7 +217,7 @@ def build_fit(
     model = build_model(trials, solution, frame, statistics, epoch, created)
     if components is not None:
         model = msgspec.structs.replace(model, joint_accuracy=_accuracy(components))
-    shown = variances[np.isfinite(variances)] / 2 * solution.determined.noise
+    shown = variances[np.isfinite(variances)] / 2 * solution.statistics.noise
     tested = lens_test(solution)
     report = CalibrationReport(
         stratum=solution.stratum,
@@ -225,7 +225,7 @@ def build_fit(
         chi2=statistics.chi2,
         degrees_of_freedom=freedom,
         chi2_ok=statistics.chi2_ok,
-        sigma_factor=float(np.sqrt(solution.determined.variance)),
+        sigma_factor=float(np.sqrt(solution.statistics.variance)),
         projective_chi2=history.projective[0],
         projective_degrees_of_freedom=history.projective[1],
         prediction_rms_px=float(np.sqrt(shown.mean())),
@@ -280,7 +280,7 @@ def _camera_report(
         k, cu, cv, _, k2, p1, p2 = (float(value) for value in solution.rig.lenses[c])
         basis = solution.charts.lenses[c]
         at = solution.charts.start(2) + sum(len(other) for other in solution.charts.lenses[:c])
-        covariance = solution.determined.covariance[at : at + len(basis), at : at + len(basis)]
+        covariance = solution.statistics.covariance[at : at + len(basis), at : at + len(basis)]
         lens = k, cu, cv
         deviations = tuple(float(value) for value in np.sqrt(np.diag(basis.T @ covariance @ basis)))
         lens_std = deviations[:3]
@@ -386,7 +386,7 @@ def _covariance(
         tuple(scale * (basis @ back) for scale, basis in zip(camera_scales, charts.cameras, strict=True)),
         tuple(basis[:, : _lens_size(solution)] for basis in charts.lenses),
         tuple(scale * (basis @ frame.T) for scale, basis in zip(point_scales, charts.points, strict=True)),
-        solution.determined.covariance,
+        solution.statistics.covariance,
     )
 
 
@@ -398,7 +398,7 @@ def intrinsics(matrix: FloatArray) -> tuple[float, float, float, float, float]:
 
 def _left_intrinsics_std(solution: Solution) -> tuple[float, ...]:
     at = solution.charts.start(1)
-    deviations = np.sqrt(np.diag(solution.determined.covariance)[at : at + 5])
+    deviations = np.sqrt(np.diag(solution.statistics.covariance)[at : at + 5])
     fx, skew, u0, fy, v0 = (float(value) for value in deviations)
     return fx, skew, fy, u0, v0
 

@@ -46,15 +46,15 @@ STRATA: dict[Stratum, str] = {
 REMEDIES = {
     "too_few_points": "show the moved camera more markers, or static ones ([scene] static), or move the arm before it",
     "points_coplanar": "show the moved camera markers off one plane: a second face, static ones, another pose",
-    "not_explained": "did markers slip, did a joint's zero or another camera move as well? Calibrate, or check, anew",
+    "not_explained": "did markers slip, did a joint's zero or another camera move as well? Calibrate, or check, again",
     "too_uncertain": "let the moved camera see more: more markers, static ones ([scene] static), another pose",
-    "bad_data": "the data are damaged or not of this cell: look at the text, record anew",
+    "bad_data": "the data are damaged or not of this cell: look at the text, record again",
     "bad_file": "the file holds no cameras, or what the wished format cannot hold: look at the text",
     "length": "state the distance of two markers that were seen, in metres",
     "model_does_not_fit": "the model was not refined on-line: `calibrate --check` tells what changed",
-    "step_too_large": "the model was not refined on-line: `calibrate --check` tells what changed; else calibrate anew",
+    "step_too_large": "the model was not refined on-line: `calibrate --check` tells what changed; else calibrate again",
     "not_better": "the model in use stays: nothing is to be done",
-    "no_covariance": "calibrate anew: a refinement starts from the covariance of a calibration",
+    "no_covariance": "calibrate again: a refinement starts from the covariance of a calibration",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
     "another calibration.base",
@@ -97,9 +97,9 @@ REMEDIES = {
     "no_baseline": "move the cameras apart, by a tenth of their distance to the markers at least",
     "mixed_mounts": "calibrate cameras that stand and cameras on the tip each on their own",
     "check_holds": "leave the zeros as they are: there is nothing to reset",
-    "other_cause": "remove the cause that the check names, or calibrate anew: a reset of zeros would hide it",
+    "other_cause": "remove the cause that the check names, or calibrate again: a reset of zeros would hide it",
     "not_observable": "take a calibration.base where the axes of the joints named are different lines, put the markers "
-    "farther from them, or calibrate anew",
+    "farther from them, or calibrate again",
 }
 """Advice for each cause of a failed calibration, by the code of its CalibrationError."""
 
@@ -200,8 +200,8 @@ def _joint_errors(report: CalibrationReport) -> str:
             if value > SEEN * deviation
         ]
         both = float(np.linalg.norm([joint.repeatable, joint.random, joint.posture]))
-        told = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
-        parts.append(f"joint {joint.name} {told} ({joint.pixels:.2g} px)")
+        text = ", ".join(found) if found else f"in all {1e3 * both:.2g} {unit}"
+        parts.append(f"joint {joint.name} {text} ({joint.pixels:.2g} px)")
     have = "may have" if report.exact_joints_chance else "have"
     return f"Joint readings {have} errors, as standard deviations: {'; '.join(parts)}"
 
@@ -255,8 +255,8 @@ def _identified(
         why = [note for note in report.notes if "refused" in note]
         if why:
             # The last attempt at the required stratum is nearest to the truth.
-            wanted = why[0].split()[0]
-            reasons.append([note for note in why if note.startswith(wanted)][-1])
+            missing = why[0].split()[0]
+            reasons.append([note for note in why if note.startswith(missing)][-1])
     if not loose and model.stratum == "metric":
         return
     short = False

@@ -50,9 +50,9 @@ def planes_at_infinity(generators: FloatArray, noise: FloatArray) -> tuple[Float
 
 def scaled_plane(plane: FloatArray, points: FloatArray) -> FloatArray | None:
     """``plane`` (4,) scaled to mean height 1 over points (m, 4) of depth 1; None if it passes between the points."""
-    heights = points @ plane / points[:, 2]
-    mean = float(heights.mean())
-    if mean == 0.0 or (heights / mean).min() <= 0.0:
+    scales = points @ plane / points[:, 2]
+    mean = float(scales.mean())
+    if mean == 0.0 or (scales / mean).min() <= 0.0:
         return None
     result: FloatArray = plane / mean
     return result
@@ -104,9 +104,9 @@ def twist_between(before: FloatArray, after: FloatArray) -> FloatArray:
     centroid, centroid_after = before.mean(axis=0), after.mean(axis=0)
     u, _, vt = np.linalg.svd((after - centroid_after).T @ (before - centroid))
     u[:, 2] *= np.linalg.det(u @ vt)
-    turn = Rotation.from_matrix(u @ vt).as_rotvec()
-    angle = float(np.linalg.norm(turn))
-    axis = turn / angle
+    rotation_vector = Rotation.from_matrix(u @ vt).as_rotvec()
+    angle = float(np.linalg.norm(rotation_vector))
+    axis = rotation_vector / angle
     # The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
     chord = centroid_after - centroid
     chord = chord - axis * (axis @ chord)

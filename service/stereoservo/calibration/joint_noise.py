@@ -24,7 +24,7 @@ from stereoservo.calibration.normal_equations import (
     prior_rows,
 )
 from stereoservo.calibration.rig_model import Charts, JointErrors, Measurements, RigModel, partial_products
-from stereoservo.geometry.distortion import bends, distortion_jacobian
+from stereoservo.geometry.distortion import distortion_jacobian, has_distortion
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
 
@@ -32,8 +32,8 @@ def joint_columns(rig: RigModel, data: Measurements) -> FloatArray:
     """Derivatives (2 k, n) of the weighted residuals by the positions of the joints at each measurement's stop."""
     stops, stop = np.unique(data.stop, return_inverse=True)
     before, after = partial_products(rig, data.offsets[stops])
-    turns = before[:-1] @ rig.generators[:, None] @ after[:-1]
-    shifts = np.einsum("jsab,mb->sjma", turns, rig.points)[stop, :, data.marker]
+    operators = before[:-1] @ rig.generators[:, None] @ after[:-1]
+    shifts = np.einsum("jsab,mb->sjma", operators, rig.points)[stop, :, data.marker]
     world = np.einsum("sab,mb->sma", after[0], rig.points)[stop, data.marker]
     matrices = rig.cameras[data.camera]
     ray = np.einsum("kca,ka->kc", matrices, world)
@@ -42,7 +42,7 @@ def joint_columns(rig: RigModel, data: Measurements) -> FloatArray:
     slopes = (change[:, :, :2] - ideal[:, None] * change[:, :, 2:]) / ray[:, None, 2:]
     for camera, lens in enumerate(rig.lenses):
         mine = data.camera == camera
-        if bends(lens):
+        if has_distortion(lens):
             slopes[mine] = np.einsum("kab,kjb->kja", distortion_jacobian(lens, ideal[mine]), slopes[mine])
     slopes /= data.sigmas[:, None, None]
     return np.ascontiguousarray(slopes.transpose(0, 2, 1)).reshape(2 * len(data.camera), -1)
@@ -90,13 +90,13 @@ def stop_rows(rig: RigModel, charts: Charts, data: Measurements, weights: Weight
         joints = np.vstack([joints, joint_columns(rig, data.select(np.arange(here.start, here.stop)))])
         while first < end <= here.stop:
             count, stop = 2 * (end - first), int(data.stop[first])
-            mine, turns = rows[:count], joints[:count]
+            mine, by_joint = rows[:count], joints[:count]
             rows, joints = rows[count:], joints[count:]
             if weights is not None:
                 root = np.sqrt(weights(mine[:, -1] ** 2))[:, None]
-                mine, turns = mine * root, turns * root
-            mine[:, -1] -= turns @ corrections[stop]
-            yield StopRows(stop, slice(first, end), turns, mine)
+                mine, by_joint = mine * root, by_joint * root
+            mine[:, -1] -= by_joint @ corrections[stop]
+            yield StopRows(stop, slice(first, end), by_joint, mine)
             first, end = end, next(ends, 0)
 
 

@@ -25,11 +25,11 @@ from stereoservo.calibration.calibration_result import CalibrationFit, FitHistor
 from stereoservo.calibration.joint_noise import StopFactor, orthogonal_factor
 from stereoservo.calibration.least_squares import RobustLoss
 from stereoservo.calibration.lens_estimation import (
-    lens_wanted,
     prior_of_lenses,
+    required_lens_model,
     starting_lenses,
-    straight_lenses,
-    straightened,
+    undistorted_lenses,
+    with_pinhole_cameras,
 )
 from stereoservo.calibration.rig_model import Measurements, RigModel, displacements, residuals
 from stereoservo.calibration.single_joint_fit import measurements
@@ -71,8 +71,8 @@ def free_arm(displacements: FloatArray) -> tuple[FloatArray, FloatArray, FloatAr
     zero = np.eye(4)
     zero[:3, :3] = Rotation.from_matrix(D[:, :3, :3]).mean().as_matrix()
     zero[:3, 3] = D[:, :3, 3].mean(axis=0)
-    turns = Rotation.from_matrix(D[:, :3, :3] @ zero[:3, :3].T)
-    positions = np.hstack([D[:, :3, 3] - zero[:3, 3], turns.as_euler("ZYX")])
+    rotations = Rotation.from_matrix(D[:, :3, :3] @ zero[:3, :3].T)
+    positions = np.hstack([D[:, :3, 3] - zero[:3, 3], rotations.as_euler("ZYX")])
     generators = np.zeros((6, 4, 4))
     generators[[0, 1, 2], [0, 1, 2], 3] = 1.0
     generators[3:] = [screw_twist(axis, zero[:3, 3]) for axis in np.eye(3)[::-1]]
@@ -143,7 +143,7 @@ ROUNDS = 5
 """Most rounds of estimating the errors of the displacements, and with them the lens model."""
 
 
-class _ErrorsSeen(NamedTuple):
+class _BundleWithErrors(NamedTuple):
     """A bundle, all its measurements, mask of their ``inliers`` (k,), and the errors of the displacements that
     whiten it, None if none are significant.
     """
@@ -184,7 +184,7 @@ def fit_with_known_arm(
         every,
         found.inliers,
         ModelFrame(np.zeros(len(trials.joint_names)), NOMINAL_PLANE),
-        FitHistory((found.solution.cost, found.solution.determined.freedom), _notes(factor)),
+        FitHistory((found.solution.cost, found.solution.statistics.freedom), _notes(factor)),
         epoch=epoch,
         created=created,
         components=found.components,
@@ -201,7 +201,7 @@ def _notes(factor: float) -> tuple[str, ...]:
     )
 
 
-def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEstimate]) -> _ErrorsSeen:
+def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEstimate]) -> _BundleWithErrors:
     """The metric bundle in the generators' frame. Raises CalibrationError."""
     _check_views(trials)
     every = measurements(trials, trials.visible, trials.positions)
@@ -218,7 +218,7 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     try:
         robust = solve(rig, every, "metric", lenses=lenses, loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
         solution, inliers = refine_to_convergence(robust.rig, every, "metric", options, lenses, ROUGHLY)
-        found = _with_errors(_ErrorsSeen(solution, every, inliers, None), at, options)
+        found = _with_errors(_BundleWithErrors(solution, every, inliers, None), at, options)
     except np.linalg.LinAlgError as error:
         raise CalibrationError(
             "no_convergence",
@@ -228,7 +228,7 @@ def _bundled(trials: TrialData, options: FitOptions, priors: Mapping[str, LensEs
     return found if found.components is None else found._replace(solution=_with_errors_stated(found, at))
 
 
-def _with_errors_stated(found: _ErrorsSeen, at: Readings) -> Solution:
+def _with_errors_stated(found: _BundleWithErrors, at: Readings) -> Solution:
     """The solution with the covariance of its parameters under the stated errors of the displacements, which exceed
     the estimated ones because few displacements determine these poorly.
     """
@@ -240,7 +240,7 @@ def _with_errors_stated(found: _ErrorsSeen, at: Readings) -> Solution:
     return replace(solution, stated_factor=factor) if isinstance(factor, StopFactor) else solution
 
 
-def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _ErrorsSeen:
+def _with_errors(found: _BundleWithErrors, at: Readings, options: FitOptions) -> _BundleWithErrors:
     """The bundle whitened by the estimated errors of the displacements, with the lenses that it then requires,
     repeated until both stay the same.
     """
@@ -250,22 +250,22 @@ def _with_errors(found: _ErrorsSeen, at: Readings, options: FitOptions) -> _Erro
         before, lenses = components, solution.lenses
         components = estimate_components(reduced_rows(solution, at), scales=False, near=before)
         if components is None or not components.significant:
-            components, factor, every = None, solution.determined.variance, every.with_joint_noise(None)
+            components, factor, every = None, solution.statistics.variance, every.with_joint_noise(None)
         else:
             factor, every = components.pixels, every.with_joint_noise(components.noise(at))
             inliers = with_whole_stops(every, inliers) if before is None else inliers
         total = max(total * factor, 1.0)
         every = replace(every, sigmas=stated * np.sqrt(total))
         solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, lenses, ROUGHLY, inliers)
-        wanted = lens_wanted(solution) if options.lens == "auto" else lenses
-        if wanted != lenses:
-            solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, wanted, ROUGHLY)
-        elif components is None or (before is not None and components.like(before)):
+        required = required_lens_model(solution) if options.lens == "auto" else lenses
+        if required != lenses:
+            solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, required, ROUGHLY)
+        elif components is None or (before is not None and components.is_close_to(before)):
             break
     solution, inliers = refine_to_convergence(solution.rig, every, "metric", options, solution.lenses)
     if options.lens == "auto" and every.lens_priors is None and not solution.converged:
         solution, inliers = _simpler_lenses(solution, every, inliers, options)
-    return _ErrorsSeen(solution, every, inliers, components)
+    return _BundleWithErrors(solution, every, inliers, components)
 
 
 def _simpler_lenses(
@@ -274,12 +274,12 @@ def _simpler_lenses(
     """The first converging bundle with fewer lens terms, if those of ``open_one`` are undetermined and explain next to
     nothing; else ``open_one`` with its ``inliers`` (k,).
     """
-    most = AS_GOOD * open_one.determined.variance
+    most = AS_GOOD * open_one.statistics.variance
     simpler: tuple[LensModel, ...] = ("radial_centre", "radial", "none")
     for lenses in simpler[simpler.index(open_one.lenses) + 1 if open_one.lenses in simpler else 0 :]:
-        rig = straightened(open_one.rig, every)
+        rig = with_pinhole_cameras(open_one.rig, every)
         found, kept = refine_to_convergence(rig, every, "metric", options, lenses)
-        if found.converged and found.determined.variance <= most:
+        if found.converged and found.statistics.variance <= most:
             return found, kept
     return open_one, inliers
 
@@ -314,10 +314,13 @@ def frame_of_known_arm(model: CellModel, generators: FloatArray) -> FloatArray:
     upgrade = model.projective_to_euclidean
     if upgrade is None:
         raise CalibrationError("bad_data", f"the model is {model.stratum}; a metric one is needed", key="stratum")
-    there = upgrade @ model.generators @ np.linalg.inv(upgrade)
+    transformed = upgrade @ model.generators @ np.linalg.inv(upgrade)
     # H G = G' H, row by row; the last row of H is (0, 0, 0, 1).
     system = np.vstack(
-        [np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4)) for one, other in zip(generators, there, strict=True)]
+        [
+            np.kron(np.eye(4), one.T) - np.kron(other, np.eye(4))
+            for one, other in zip(generators, transformed, strict=True)
+        ]
     )
     found, _, rank, _ = np.linalg.lstsq(system[:, :12], -system[:, 15], rcond=1e-9)
     if rank < 12:
@@ -366,12 +369,12 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
         trials.generators,
         np.zeros((c, 3, 4)),
         np.zeros((m, 4)),
-        straight_lenses(trials),
+        undistorted_lenses(trials),
         True,
     )
     moved = displacements(rig, trials.positions)
-    middle = _middle(trials.generators)
-    path = moved[:, :3, :3] @ middle + moved[:, :3, 3]
+    origin = _body_origin(trials.generators)
+    path = moved[:, :3, :3] @ origin + moved[:, :3, 3]
     spread = float(np.sqrt(path.var(axis=0).sum()))
     if not spread > LEAST_MOTION:
         raise CalibrationError(
@@ -382,7 +385,7 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
             joints=n,
         )
     to_unit = np.eye(4) / spread
-    to_unit[:3, 3], to_unit[3, 3] = -middle / spread, 1.0
+    to_unit[:3, 3], to_unit[3, 3] = -origin / spread, 1.0
     N = np.array([pixel_normaliser(camera.width, camera.height) for camera in trials.cameras])
     data = _Normalised(
         to_unit @ moved @ np.linalg.inv(to_unit),
@@ -393,13 +396,13 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
     best: Solution | None = None
     costs: list[float] = []
     for _, cameras, points in sorted(found, key=lambda one: one[0])[:BUNDLES]:
-        there = replace(
+        start = replace(
             rig,
             cameras=np.linalg.inv(N) @ cameras @ to_unit,
             points=to_homogeneous(points) @ np.linalg.inv(to_unit).T,
         )
         try:
-            solution = solve(there, every, "metric", loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
+            solution = solve(start, every, "metric", loss=RobustLoss("soft_l1", 2.0), tolerance=1e-6)
         except np.linalg.LinAlgError:
             continue  # a guess with points in a focal plane
         robust = float(np.sqrt(1.0 + residuals(solution.rig, every) ** 2).sum())
@@ -417,14 +420,14 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
     return best.rig
 
 
-def _middle(generators: FloatArray) -> FloatArray:
+def _body_origin(generators: FloatArray) -> FloatArray:
     """The point (3,) nearest to all axes of rotation, for a free arm the body's origin at its zero: the centre of the
     guesses.
     """
-    turns = generators[np.abs(generators[:, :3, :3]).any(axis=(1, 2))]
-    if not len(turns):
+    rotations = generators[np.abs(generators[:, :3, :3]).any(axis=(1, 2))]
+    if not len(rotations):
         return np.zeros(3)
-    return np.asarray(np.linalg.lstsq(turns[:, :3, :3].reshape(-1, 3), -turns[:, :3, 3].ravel(), rcond=1e-9)[0])
+    return np.asarray(np.linalg.lstsq(rotations[:, :3, :3].reshape(-1, 3), -rotations[:, :3, 3].ravel(), rcond=1e-9)[0])
 
 
 def _guesses() -> FloatArray:
@@ -443,10 +446,10 @@ def _linear(data: _Normalised, guess: FloatArray, m: int) -> tuple[float, FloatA
     points = np.tile(guess, (m, 1))
     seen = np.isfinite(data.pixels)
     count = np.maximum(seen.sum(axis=2, keepdims=True), 1)
-    middles = np.where(seen, np.where(seen, data.pixels, 0.0).sum(axis=2, keepdims=True) / count, np.nan)
+    centroids = np.where(seen, np.where(seen, data.pixels, 0.0).sum(axis=2, keepdims=True) / count, np.nan)
     try:
-        for turn in range(ALTERNATIONS):
-            cameras = _resected(data.moved, points, middles if turn == 0 else data.pixels)
+        for iteration in range(ALTERNATIONS):
+            cameras = _resected(data.moved, points, centroids if iteration == 0 else data.pixels)
             points = _linear_points(data, cameras)
         cameras = _resected(data.moved, points, data.pixels)
     except (GeometryError, np.linalg.LinAlgError):

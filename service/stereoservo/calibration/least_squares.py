@@ -172,7 +172,7 @@ class Fit(Protocol[S]):
     def equations(self, state: S) -> Equations:
         """The normal equations at a state."""
 
-    def moved(self, state: S, x: FloatArray) -> S:
+    def retract(self, state: S, x: FloatArray) -> S:
         """The state at parameters ``x`` (p,) of the charts about ``state``."""
 
 
@@ -220,7 +220,7 @@ def minimise(fit: Fit[S], state: S, limits: Limits = LIMITS) -> Minimum[S]:
             except np.linalg.LinAlgError:
                 damping = max(10.0 * damping, 1e-12)
                 continue
-            trial = fit.moved(state, x)
+            trial = fit.retract(state, x)
             least = fit.cost(trial)
             evaluations += 1
             gain = (cost - least) / expected if expected > 0.0 else 0.0
@@ -238,12 +238,12 @@ def minimise(fit: Fit[S], state: S, limits: Limits = LIMITS) -> Minimum[S]:
 @dataclass(frozen=True)
 class DenseFit(Generic[S]):
     """A fit of few parameters: ``residuals`` (k, d) [sigmas] at a state, in groups of d that share a weight, their
-    ``slopes`` (k, d, p) by the parameters of the charts, and the state after a ``step`` (p,) of these. ``prior``: rows
-    (r, p + 1) of prior information, residuals last.
+    ``jacobian`` (k, d, p) by the parameters of the charts, and the state after a ``step`` (p,) of these. ``prior``:
+    rows (r, p + 1) of prior information, residuals last.
     """
 
     residuals: Callable[[S], FloatArray]
-    slopes: Callable[[S], FloatArray]
+    jacobian: Callable[[S], FloatArray]
     step: Callable[[S, FloatArray], S]
     loss: RobustLoss | None = None
     prior: Callable[[S], FloatArray] | None = None
@@ -257,7 +257,7 @@ class DenseFit(Generic[S]):
     def rows(self, state: S) -> FloatArray:
         """Weighted rows (.., p + 1), residuals last, those of the prior below."""
         error = self.residuals(state)
-        rows = np.concatenate([self.slopes(state), error[..., None]], axis=2)
+        rows = np.concatenate([self.jacobian(state), error[..., None]], axis=2)
         if self.loss is not None:
             rows = rows * np.sqrt(self.loss.weights((error**2).sum(axis=1)))[:, None, None]
         rows = rows.reshape(error.size, rows.shape[2])
@@ -267,19 +267,19 @@ class DenseFit(Generic[S]):
         """The normal equations at a state."""
         return DenseEquations.of(self.rows(state))
 
-    def moved(self, state: S, x: FloatArray) -> S:
+    def retract(self, state: S, x: FloatArray) -> S:
         """The state at parameters ``x`` (p,)."""
         return self.step(state, x)
 
-    def determined(self, state: S) -> Determined:
+    def statistics(self, state: S) -> EstimationStatistics:
         """Statistics of the parameters determined at a state."""
         rows = self.rows(state)
-        return Determined(
+        return EstimationStatistics(
             self.cost(state), len(rows), rows.shape[1] - 1, lambda: np.asarray(np.linalg.qr(rows[:, :-1], mode="r"))
         )
 
 
-def numeric_slopes(
+def numeric_jacobian(
     residuals: Callable[[S], FloatArray], step: Callable[[S, FloatArray], S], size: int, width: float
 ) -> Callable[[S], FloatArray]:
     """Slopes (k, d, p) of `DenseFit` by forward differences of ``width``, of ``size`` parameters."""
@@ -305,7 +305,7 @@ def chi2_within(chi2: float, freedom: int) -> bool:
 
 
 @dataclass(frozen=True)
-class Determined:
+class EstimationStatistics:
     """Statistics of a fit with ``rows`` equations and ``parameters``, net of gauge, at a ``cost``; ``factor`` computes
     a root (.., p) of its information matrix.
     """

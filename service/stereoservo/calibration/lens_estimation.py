@@ -20,11 +20,11 @@ from scipy.stats import chi2 as chi2_distribution
 from stereoservo.calibration.bundle_adjustment import Solution
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES
 from stereoservo.calibration.joint_noise import orthogonal_factor
-from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_slopes
+from stereoservo.calibration.least_squares import DenseFit, Limits, RobustLoss, minimise, numeric_jacobian
 from stereoservo.calibration.rig_model import LensPriors, Measurements, RigModel, predicted, residuals
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, finite_rows
 from stereoservo.geometry.cameras import isotropic_normaliser
-from stereoservo.geometry.distortion import LensEstimate, straight_lens, terms_jacobian, undistort
+from stereoservo.geometry.distortion import LensEstimate, pinhole_lens, terms_jacobian, undistort
 from stereoservo.geometry.fundamental import INLIER_SIGMAS, fundamental_robust, sampson_distances
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.model import pinhole
@@ -88,12 +88,12 @@ def lens_test(solution: Solution) -> LensTest:
 def terms_test(solution: Solution) -> LensTest:
     """Chi-square, to first order, of the second radial and both tangential terms of all lenses that lack them."""
     gain, terms = _gain(solution, _distortion_columns(solution))
-    freedom = max(1, solution.determined.freedom - terms)
+    freedom = max(1, solution.statistics.freedom - terms)
     factor = max(1.0, (solution.cost - gain) / freedom)
     return LensTest(gain / factor, terms, float(chi2_distribution.isf(LENS_TAIL, terms)))
 
 
-def lens_wanted(solution: Solution) -> LensModel:
+def required_lens_model(solution: Solution) -> LensModel:
     """The lens model that the bundle's residuals require: its own, or a richer one.
 
     Terms that a lens lacks are compared with scale factors of the joints, which they imitate: the hypothesis of
@@ -123,7 +123,7 @@ def _evidence(solution: Solution) -> tuple[float, float]:
     found = []
     for columns in (_distortion_columns(solution), scale_columns(solution, joints)):
         gain, count = _gain(solution, columns)
-        found.append(gain / max(1.0, solution.determined.variance) - count * float(np.log(solution.rows)))
+        found.append(gain / max(1.0, solution.statistics.variance) - count * float(np.log(solution.rows)))
     return found[0], found[1]
 
 
@@ -158,7 +158,7 @@ def _distortion_columns(solution: Solution) -> FloatArray:
     return out.reshape(2 * len(out), -1)
 
 
-STARTING_BENDS = (-0.1, -0.04, -0.2, 0.04)
+INITIAL_DISTORTIONS = (-0.1, -0.04, -0.2, 0.04)
 """Radial parameters at half the image width of all cameras, from which fits start if the search has failed."""
 MOST_ASPECT = 1.5
 """Largest plausible ratio of a pixel's sides."""
@@ -185,7 +185,7 @@ def starting_lenses(
             key="lens_priors",
             unknown=unknown,
         )
-    lenses = straight_lenses(trials)
+    lenses = undistorted_lenses(trials)
     if bend is not None:
         lenses[:, 0] = bend
         return lenses, FREE_LENS if asked == "auto" else asked
@@ -207,7 +207,7 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
 
     ``CENTRE_SHARE`` of the width is the centre's standard deviation, ``TERM_SPREADS`` those of the terms.
     """
-    straight = straight_lenses(trials)
+    straight = undistorted_lenses(trials)
     mean, information = np.zeros((len(straight), 6)), np.zeros((len(straight), 6, 6))
     mean[:, :3] = straight[:, :3]
     information[:, [3, 4, 5], [3, 4, 5]] = 1.0 / np.array(TERM_SPREADS) ** 2
@@ -248,7 +248,7 @@ def implausible_lens(result: CalibrationFit) -> CalibrationError | None:
     return None
 
 
-def straightened(rig: RigModel, data: Measurements) -> RigModel:
+def with_pinhole_cameras(rig: RigModel, data: Measurements) -> RigModel:
     """The rig with pinhole cameras, distortion centres from the priors of ``data``."""
     lenses = rig.lenses.copy()
     lenses[:, [0, 4, 5, 6]] = 0.0
@@ -265,7 +265,7 @@ NOISE_AGREEMENT = 0.99
 """Share expected of pinholes: 0.999 for Gaussian noise, reduced for outlying matches."""
 COARSE_PX = 1.5
 """Epipolar distance [px], beside its noise, that a match may have at a grid point."""
-MOST_BEND = 0.6
+LARGEST_DISTORTION = 0.6
 """Largest magnitude of an initial radial parameter."""
 WORTH_SHARE = 0.03
 """Least increase of the share of fitting matches by a lens: other misfit is not due to the lens."""
@@ -285,9 +285,9 @@ MOST_MATCHES = 20_000
 """Most matches of two cameras, evenly spread, that the search for a lens uses."""
 
 
-def straight_lenses(trials: TrialData) -> FloatArray:
+def undistorted_lenses(trials: TrialData) -> FloatArray:
     """Lenses (c, 4) without distortion for the cameras of the trials."""
-    return np.array([straight_lens(camera.width, camera.height) for camera in trials.cameras])
+    return np.array([pinhole_lens(camera.width, camera.height) for camera in trials.cameras])
 
 
 def undistorted(trials: TrialData, lenses: FloatArray) -> TrialData:
@@ -317,7 +317,7 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
 
     A lens is accepted if it lowers the robust epipolar cost by far more than chance does (``START_GAIN``).
     """
-    lenses = straight_lenses(trials)
+    lenses = undistorted_lenses(trials)
     for k in range(1, len(trials.cameras)):
         match = _matches(trials, k)
         if match is None or _agreement(*match, lenses[[0, k]]) >= PINHOLE_AGREEMENT:
@@ -330,9 +330,9 @@ def epipolar_lenses(trials: TrialData) -> FloatArray:
     return lenses
 
 
-def lenses_may_bend(trials: TrialData) -> bool:
+def distortion_is_possible(trials: TrialData) -> bool:
     """Whether, for some pair of cameras, fewer matches fit than pinholes with noise explain."""
-    straight = straight_lenses(trials)
+    straight = undistorted_lenses(trials)
     for k in range(1, len(trials.cameras)):
         match = _matches(trials, k)
         if match is not None and _agreement(*match, straight[[0, k]]) < NOISE_AGREEMENT:
@@ -388,7 +388,7 @@ def _pair_lenses(raw: FloatArray, sigmas: FloatArray, lenses: FloatArray, free: 
     noise = sigmas * max(1.0, typical)
     _, cost, _ = _refined(raw, noise, bent, F, (), bound=max(least, 1.0))
     _, without, _ = _refined(raw, noise, lenses, straight[0], (), bound=max(least, 1.0))
-    if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > MOST_BEND:
+    if not without - cost > START_GAIN or np.abs(bent[:, 0]).max() > LARGEST_DISTORTION:
         return None
     # Wrong matches do not fit with any lens.
     return bent if _agreement(raw, noise, bent) > _agreement(raw, noise, lenses) + WORTH_SHARE else None
@@ -462,7 +462,7 @@ def _refined(
     def step(z: FloatArray, x: FloatArray) -> FloatArray:
         return np.clip(z + x, -limit, limit)
 
-    slopes = numeric_slopes(errors, np.add, len(limit), 1e-7)
+    slopes = numeric_jacobian(errors, np.add, len(limit), 1e-7)
     z, cost = np.zeros(len(limit)), np.inf
     for scale in (3.0 * bound, 3.0):
         fit = DenseFit(

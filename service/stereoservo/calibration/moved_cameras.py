@@ -18,7 +18,7 @@ import numpy.typing as npt
 from stereoservo.calibration.bundle_adjustment import jacobian
 from stereoservo.calibration.least_squares import DenseFit, Limits, Minimum, RobustLoss, minimise
 from stereoservo.calibration.rig_model import Charts, Measurements, acting_order, own_acting_rig
-from stereoservo.geometry.distortion import bends, distort, distortion_jacobian
+from stereoservo.geometry.distortion import distort, distortion_jacobian, has_distortion
 from stereoservo.kinematics.kernels import exp_twist
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -61,7 +61,7 @@ class Correspondences:
         )
 
 
-class Moved(NamedTuple):
+class CameraMotionEstimate(NamedTuple):
     """``matrices`` (c, 3, 4) of cameras under estimation, and the ``motion`` D (4, 4) with ``P D`` of the previous
     matrices P; None if the matrices are free.
     """
@@ -80,7 +80,7 @@ class MatrixChange(Protocol):
     def directions(self, matrices: FloatArray) -> FloatArray:
         """Derivative (c, size, 3, 4) of the matrices by the parameters, at 0."""
 
-    def step(self, moved: Moved, x: FloatArray) -> Moved:
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
         """The matrices at parameters ``x`` (size,)."""
 
 
@@ -98,10 +98,10 @@ class RigidMotion:
         found: FloatArray = matrices[:, None] @ self.algebra[None]
         return found
 
-    def step(self, moved: Moved, x: FloatArray) -> Moved:
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
         assert moved.motion is not None
         motion = exp_twist(np.tensordot(x, self.algebra, axes=1))
-        return Moved(moved.matrices @ motion, moved.motion @ motion)
+        return CameraMotionEstimate(moved.matrices @ motion, moved.motion @ motion)
 
 
 @dataclass(frozen=True)
@@ -115,8 +115,8 @@ class FreeMatrix:
         rows = np.linalg.svd(matrix.reshape(1, 12))[2][1:]
         return np.asarray(rows.reshape(1, 11, 3, 4) * np.linalg.norm(matrices[0]))
 
-    def step(self, moved: Moved, x: FloatArray) -> Moved:
-        return Moved(moved.matrices + np.tensordot(x, self.directions(moved.matrices)[0], axes=1), None)
+    def step(self, moved: CameraMotionEstimate, x: FloatArray) -> CameraMotionEstimate:
+        return CameraMotionEstimate(moved.matrices + np.tensordot(x, self.directions(moved.matrices)[0], axes=1), None)
 
 
 def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) -> FloatArray:
@@ -127,7 +127,7 @@ def predicted(matrices: FloatArray, lenses: FloatArray, views: Correspondences) 
     pixels: FloatArray = np.empty_like(ideal)
     for c, lens in enumerate(lenses):
         mine = views.camera == c
-        pixels[mine] = distort(lens, ideal[mine]) if bends(lens) else ideal[mine]
+        pixels[mine] = distort(lens, ideal[mine]) if has_distortion(lens) else ideal[mine]
     return pixels
 
 
@@ -138,7 +138,7 @@ def entry_jacobian(matrices: FloatArray, lenses: FloatArray, views: Corresponden
     bend = np.tile(np.eye(2), (len(ideal), 1, 1))
     for c, lens in enumerate(lenses):
         mine = views.camera == c
-        if bends(lens):
+        if has_distortion(lens):
             bend[mine] = distortion_jacobian(lens, ideal[mine])
     by_image = np.zeros((len(ideal), 2, 3))
     by_image[:, 0, 0] = by_image[:, 1, 1] = 1.0
@@ -171,7 +171,7 @@ def matrix_fit(
     views: Correspondences,
     whiten: Callable[[FloatArray], FloatArray],
     loss: RobustLoss | None = None,
-) -> DenseFit[Moved]:
+) -> DenseFit[CameraMotionEstimate]:
     """The fit of matrices; ``whiten`` converts rows (k, 2, q) from px to sigmas."""
     return DenseFit(
         lambda moved: whiten((predicted(moved.matrices, lenses, views) - views.pixels)[..., None])[..., 0],
@@ -182,8 +182,8 @@ def matrix_fit(
 
 
 def fit_with_outliers(
-    family: MatrixChange, starts: list[Moved], lenses: FloatArray, views: Correspondences
-) -> Minimum[Moved]:
+    family: MatrixChange, starts: list[CameraMotionEstimate], lenses: FloatArray, views: Correspondences
+) -> Minimum[CameraMotionEstimate]:
     """The best robust fit to ``views``, some of whose ids may be wrong, from several starts and subsets of ids; its
     cost is infinite if every start has points behind a camera.
     """
@@ -281,7 +281,7 @@ def inherited_errors(model: CellModel, group: tuple[int, ...], motion: FloatArra
 def model_jacobian(
     model: CellModel,
     group: tuple[int, ...],
-    moved: Moved,
+    moved: CameraMotionEstimate,
     views: Correspondences,
     offsets: FloatArray,
 ) -> FloatArray:
@@ -367,7 +367,7 @@ def scene_by_model(model: CellModel, i: int) -> FloatArray:
     held = model_jacobian(
         model,
         tuple(seen),
-        Moved(matrices, np.eye(4)),
+        CameraMotionEstimate(matrices, np.eye(4)),
         replace(views, ids=np.full(len(seen), -1)),
         np.zeros((0, len(model.zero))),
     ).reshape(2 * len(seen), -1)
@@ -464,7 +464,9 @@ def predicted_deviation(model: CellModel, errors: list[CameraErrors], joints: Fl
                 rows = entry_jacobian(matrices, lenses, views)
                 variances = np.einsum("kia,ab,kib->ki", rows, one.covariance[mine, mine], rows, optimize=True)
             else:
-                rows = model_jacobian(model, (c,), Moved(matrices, np.eye(4)), views, joints - model.zero)
+                rows = model_jacobian(
+                    model, (c,), CameraMotionEstimate(matrices, np.eye(4)), views, joints - model.zero
+                )
                 variances = np.einsum("kia,ab,kib->ki", rows, model.covariance.covariance, rows, optimize=True)
             worst = max(worst, float(np.sqrt(variances.max())))
     return worst if some else np.inf

@@ -23,7 +23,7 @@ from stereoservo.calibration.rig_model import (
     RigModel,
     partial_products,
 )
-from stereoservo.geometry.strata import intrinsics_and_slopes
+from stereoservo.geometry.strata import intrinsics_and_jacobian
 from stereoservo.kinematics.parameterization import LENS_PARAMETERS
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
@@ -117,7 +117,7 @@ class Projections(NamedTuple):
     lens_start: IntArray
 
 
-class Sightings(NamedTuple):
+class Detections(NamedTuple):
     """k measurements: indices of ``camera``, ``stop`` and ``marker`` (k,), ``pixels`` (k, 2), ``sigmas`` (k,) [px]."""
 
     camera: IntArray
@@ -136,7 +136,7 @@ class Markers(NamedTuple):
 
 @kernel
 def _rows_into(
-    motions: Motions, projections: Projections, markers: Markers, seen: Sightings, core: FloatArray, own: FloatArray
+    motions: Motions, projections: Projections, markers: Markers, seen: Detections, core: FloatArray, own: FloatArray
 ) -> None:
     """Fill weighted rows of measurements that are sorted by stop and marker; ``stop`` counts from the chunk's
     first.
@@ -283,7 +283,7 @@ def chunks(rig: RigModel, charts: Charts, data: Measurements) -> Iterator[tuple[
             np.ascontiguousarray(generator_basis.transpose(1, 2, 0)),
             _starts(charts.generators),
         )
-        seen = Sightings(data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here])
+        seen = Detections(data.camera[here], stop - stop[0], data.marker[here], data.pixels[here], data.sigmas[here])
         markers = Markers(np.ascontiguousarray(rig.points), point_basis)
         _rows_into(motions, projections, markers, seen, core, own)
         yield here, Rows(core, own, data.marker[here])
@@ -328,7 +328,7 @@ def _tie_rows(rig: RigModel, charts: Charts, ties: PinholeTies) -> FloatArray:
     sigmas = np.array([ties.skew, ties.aspect, ties.centre, ties.centre])
     for matrix, basis, lens, lens_basis in zip(rig.cameras, charts.cameras, rig.lenses, charts.lenses, strict=True):
         if len(basis):
-            (fx, fy, skew, cu, cv), slopes = intrinsics_and_slopes(matrix, basis)
+            (fx, fy, skew, cu, cv), slopes = intrinsics_and_jacobian(matrix, basis)
             centre_slopes = lens_basis[:, 1:3]
             out = np.zeros((4, charts.size + 1))
             mine = slice(camera_at, camera_at + len(basis))

@@ -21,10 +21,10 @@ from stereoservo.calibration.least_squares import minimise
 from stereoservo.calibration.moved_cameras import (
     WHOLE,
     CameraErrors,
+    CameraMotionEstimate,
     Correspondences,
     FreeMatrix,
     MatrixChange,
-    Moved,
     RigidMotion,
     fit_with_outliers,
     inherited_errors,
@@ -47,7 +47,7 @@ from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
 How = Literal["moved", "moved_and_refocused", "resected", "moved_with_rig"]
-WORDS: dict[How, str] = {
+DESCRIPTIONS: dict[How, str] = {
     "moved": "moved",
     "moved_and_refocused": "moved, and its focal length or principal point changed (was the lens touched?)",
     "resected": "moved",
@@ -95,15 +95,15 @@ def describe_moved_camera(
     moved_px: float,
 ) -> MovedCamera:
     """Describe the motion of a camera whose matrix (3, 4) is ``new`` instead of ``old``; it sees ``points`` (k, 4)."""
-    turned = share = metres = None
-    words = WORDS[how]
+    angle_deg = share = metres = None
+    words = DESCRIPTIONS[how]
     if model.projective_to_euclidean is not None:
-        turned, share, metres = _displacement(model, model.projective_to_euclidean, old, new, points)
+        angle_deg, share, metres = _displacement(model, model.projective_to_euclidean, old, new, points)
         far = "" if metres is None else f" ({1000.0 * metres:.3g} mm)"
         shift = f"{100.0 * share:.2g} % of its distance from the points{far}"
-        words += f": turned by {turned:.3g} degrees, shifted by {shift}"
+        words += f": turned by {angle_deg:.3g} degrees, shifted by {shift}"
     text = f"camera {name!r} {words}; its points moved by {moved_px:.3g} px rms"
-    return MovedCamera(how, turned, share, metres, moved_px, text)
+    return MovedCamera(how, angle_deg, share, metres, moved_px, text)
 
 
 def _displacement(
@@ -111,25 +111,27 @@ def _displacement(
 ) -> tuple[float, float, float | None]:
     """Angle [deg], displacement of the centre over the distance from the points, and in [m] if a scale is known."""
     back = np.linalg.inv(H)
-    turns, centres = [], []
+    rotations, centres = [], []
     for matrix in (old, new):
         P = matrix @ back
         P = P * np.sign(np.linalg.det(P[:, :3]))
         K, R = rq(P[:, :3])
-        turns.append(np.diag(np.sign(np.diag(K))) @ R)
+        rotations.append(np.diag(np.sign(np.diag(K))) @ R)
         centres.append(-np.linalg.solve(P[:, :3], P[:, 3]))
-    turn = turns[1] @ turns[0].T
-    sine = 0.5 * np.linalg.norm([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-    angle = float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(turn) - 1.0))))
+    rotation = rotations[1] @ rotations[0].T
+    sine = 0.5 * np.linalg.norm(
+        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
+    )
+    angle = float(np.degrees(np.arctan2(sine, 0.5 * (np.trace(rotation) - 1.0))))
     euclidean = points @ H.T
-    middle = (euclidean[:, :3] / euclidean[:, 3:]).mean(axis=0)
+    centroid = (euclidean[:, :3] / euclidean[:, 3:]).mean(axis=0)
     distance_moved = float(np.linalg.norm(centres[1] - centres[0]))
     metre = [
         float(np.linalg.norm((H @ generator @ back)[:3, 3]))
         for generator, kind in zip(model.generators, model.joint_kinds, strict=True)
         if kind == "prismatic"
     ]
-    distance = float(np.linalg.norm(middle - centres[0]))
+    distance = float(np.linalg.norm(centroid - centres[0]))
     return angle, distance_moved / distance, distance_moved / float(np.median(metre)) if metre else None
 
 
@@ -173,7 +175,7 @@ def not_explained(
         "not_explained",
         f"no motion of camera {_listed(names)} explains its pixels: chi-square {chi2:.4g} with {freedom} degrees of "
         f"freedom (limit {limit:.4g}), {share:.0%} of them left out as wrong (limit {most:.0%}){ids}. Did markers "
-        "slip, did a joint's zero or another camera move, are ids mixed up? If so calibrate, or check, anew",
+        "slip, did a joint's zero or another camera move, are ids mixed up? If so calibrate, or check, again",
         cameras=names,
         chi2=chi2,
         limit=limit,
@@ -251,7 +253,7 @@ def relocalize_group(
     cameras = [model.cameras[c] for c in group]
     lenses = np.array([camera.lens for camera in cameras])
     views = _renumbered(views, group)
-    start = facing(np.array([camera.matrix for camera in cameras]), views)
+    start = with_positive_depths(np.array([camera.matrix for camera in cameras]), views)
     attempts: list[tuple[MatrixChange, How]] = []
     if model.stratum == "metric":
         assert model.projective_to_euclidean is not None
@@ -302,7 +304,7 @@ def _renumbered(views: Correspondences, group: tuple[int, ...]) -> Correspondenc
     return replace(views, camera=camera)
 
 
-def facing(matrices: FloatArray, views: Correspondences) -> FloatArray:
+def with_positive_depths(matrices: FloatArray, views: Correspondences) -> FloatArray:
     """Matrices (c, 3, 4) with the sign that puts the points in front of their cameras."""
     depths = np.einsum("kj,kj->k", matrices[views.camera, 2], views.points)
     signs = [
@@ -355,7 +357,7 @@ def _attempt(
     """Fit of one class of motion: robust, then least squares in the full covariance of pixels and model."""
     _refuse_few(model, views, group, family, how)
     free = isinstance(family, FreeMatrix)
-    starts = [Moved(start, None if free else np.eye(4))]
+    starts = [CameraMotionEstimate(start, None if free else np.eye(4))]
     if free:
         starts += _resected(views, lenses)
     found = fit_with_outliers(family, starts, lenses, views)
@@ -369,7 +371,7 @@ def _attempt(
         _refuse_few(model, inside, group, family, how)
         solved = _least_squares(model, group, family, moved, lenses, inside, offsets)
         settled = bool(np.array_equal(again, keep))
-        moved, keep = Moved(solved.matrices, solved.motion), again
+        moved, keep = CameraMotionEstimate(solved.matrices, solved.motion), again
         if settled:
             break
     outliers = _outliers(model, group, solved.matrices, lenses, views, keep)
@@ -383,7 +385,7 @@ def _attempt(
 def _inliers(
     model: CellModel,
     group: tuple[int, ...],
-    moved: Moved,
+    moved: CameraMotionEstimate,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -414,7 +416,7 @@ def _least_squares(
     model: CellModel,
     group: tuple[int, ...],
     family: MatrixChange,
-    moved: Moved,
+    moved: CameraMotionEstimate,
     lenses: FloatArray,
     views: Correspondences,
     offsets: FloatArray,
@@ -430,13 +432,13 @@ def _least_squares(
         for i in range(k):
             noise[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] += views.covariances[i]
         white = np.linalg.inv(np.linalg.cholesky(noise + F @ sigma @ F.T))
-        fit = matrix_fit(family, lenses, views, _jointly(white))
+        fit = matrix_fit(family, lenses, views, _joint_whitening(white))
         found = minimise(fit, moved, WHOLE)
         if not np.isfinite(found.cost):
             wrong = tuple(int(i) for i in np.unique(views.ids))
             raise not_explained(names, np.inf, np.inf, 0, wrong, 1.0, MAX_OUTLIERS)
         moved = found.state
-        determined = fit.determined(moved)
+        determined = fit.statistics(moved)
         if determined.rank < family.size:
             raise points_coplanar(names, k, len(np.unique(views.ids)))
     gain = determined.root @ determined.root.T @ fit.rows(moved)[:, :-1].T @ white
@@ -462,17 +464,17 @@ def _least_squares(
     )
 
 
-def _jointly(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def _joint_whitening(white: FloatArray) -> Callable[[FloatArray], FloatArray]:
     """Whitening of rows (k, 2, q) by the inverse root (2 k, 2 k) of the covariance of all pixels together."""
     return lambda rows: (white @ rows.reshape(len(white), -1)).reshape(rows.shape)
 
 
-def _resected(views: Correspondences, lenses: FloatArray) -> list[Moved]:
+def _resected(views: Correspondences, lenses: FloatArray) -> list[CameraMotionEstimate]:
     """The matrix of a camera by linear resection and refinement, if the points determine it; else empty."""
     ideal = undistort(lenses[0], views.pixels)
     sigma = float(np.sqrt(np.median(np.trace(views.covariances, axis1=1, axis2=2)) / 2.0))
     try:
-        return [Moved(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
+        return [CameraMotionEstimate(resect_moved_camera(views.points, ideal, sigma).P[None], None)]
     except GeometryError:
         return []  # the previous matrix may still be near; least squares show whether it is determined
 
@@ -563,7 +565,7 @@ class RestPose:
     """The arm at rest: its ``joints`` (n,) [rad or m], and the cameras' observations meanwhile."""
 
     joints: FloatArray
-    sights: tuple[CameraSample, ...]
+    samples: tuple[CameraSample, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -666,7 +668,7 @@ def _views(model: CellModel, observations: RestObservations, which: tuple[int, .
     static = {marker: i for i, marker in enumerate(model.scene_ids)}
     rows: list[tuple[int, int, int, FloatArray, FloatArray, FloatArray]] = []
     for k, pose in enumerate(observations.poses):
-        for sample in pose.sights:
+        for sample in pose.samples:
             if sample.camera not in names:
                 continue
             _check_sample(sample, k)
@@ -744,7 +746,7 @@ def _moved_camera(model: CellModel, one: CameraGroup, k: int) -> MovedCamera:
     camera = model.cameras[one.cameras[k]]
     mine = one.views.select(one.views.camera == k)
     mine = replace(mine, camera=np.zeros_like(mine.camera))
-    old, lens = facing(camera.matrix[None], mine), camera.lens[None]
-    motion_px = predicted(facing(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
+    old, lens = with_positive_depths(camera.matrix[None], mine), camera.lens[None]
+    motion_px = predicted(with_positive_depths(one.matrices[k : k + 1], mine), lens, mine) - predicted(old, lens, mine)
     moved_px = float(np.sqrt(np.nanmean((motion_px**2).sum(axis=1))))
     return describe_moved_camera(model, camera.name, one.how, camera.matrix, one.matrices[k], mine.points, moved_px)

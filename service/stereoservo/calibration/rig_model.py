@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
-from stereoservo.geometry.distortion import bends, distort
+from stereoservo.geometry.distortion import distort, has_distortion
 from stereoservo.kinematics.axes import stratum_frame
 from stereoservo.kinematics.model import (
     CellModel,
@@ -99,14 +99,14 @@ class JointNoise:
     posture: FloatArray
 
     @property
-    def giving_way(self) -> IntArray:
+    def posture_dependent(self) -> IntArray:
         """Joints with errors that change with the posture."""
         return np.flatnonzero(self.posture > 0.0)
 
     @property
     def common(self) -> int:
         """Number of errors that stops share."""
-        return len(self.deviations) + len(self.giving_way) * int(self.features.shape[1])
+        return len(self.deviations) + len(self.posture_dependent) * int(self.features.shape[1])
 
     def common_factors(self, stops: IntArray) -> FloatArray:
         """Derivatives (k, n, common) of each joint's error at ``stops`` (k,) by each shared error."""
@@ -115,7 +115,7 @@ class JointNoise:
         at, joint = np.nonzero(self.shared[stops] >= 0)
         error = self.shared[stops[at], joint]
         factors[at, joint, error] = self.deviations[error]
-        for k, one in enumerate(self.giving_way):
+        for k, one in enumerate(self.posture_dependent):
             factors[:, one, e + k * r : e + (k + 1) * r] = self.posture[one] * self.features[stops]
         return factors
 
@@ -123,9 +123,9 @@ class JointNoise:
         """Errors (s, n) [rad or m] due to the shared ones ``common`` (common,)."""
         e, r = len(self.deviations), self.features.shape[1]
         found = np.append(common[:e] * self.deviations, 0.0)[self.shared]
-        for k, joint in enumerate(self.giving_way):
-            course = self.features @ common[e + k * r : e + (k + 1) * r]
-            found[:, joint] += self.posture[joint] * course
+        for k, joint in enumerate(self.posture_dependent):
+            error = self.features @ common[e + k * r : e + (k + 1) * r]
+            found[:, joint] += self.posture[joint] * error
         return np.asarray(found)
 
 
@@ -340,7 +340,7 @@ def expected_pixels(rig: RigModel, offsets: FloatArray) -> FloatArray:
 
 def _through(lens: FloatArray, ideal: FloatArray) -> FloatArray:
     """Raw pixels (k, 2) of ideal ones through a lens (7,), with or without second radial and tangential terms."""
-    if not bends(lens):
+    if not has_distortion(lens):
         return ideal
     return distort(lens if lens[4:].any() else lens[:4], ideal)
 

@@ -28,12 +28,12 @@ from stereoservo.calibration.calibration_result import (
     build_fit,
     completed,
 )
-from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested
+from stereoservo.calibration.diagnosis.failure_diagnosis import diagnose_failure, review_notes, untested_properties
 from stereoservo.calibration.diagnosis.input_corrections import Refit
 from stereoservo.calibration.diagnosis.joint_scales import (
     ScalesError,
     explains,
-    one_thing_happened,
+    is_single_event,
     refuse_wrong_scales,
     scales_error,
     small_scales,
@@ -46,11 +46,11 @@ from stereoservo.calibration.least_squares import RobustLoss, chi2_within
 from stereoservo.calibration.lens_estimation import (
     FREE_LENS,
     FULL_LENS,
-    STARTING_BENDS,
+    INITIAL_DISTORTIONS,
+    distortion_is_possible,
     implausible_lens,
-    lens_wanted,
-    lenses_may_bend,
     prior_of_lenses,
+    required_lens_model,
     starting_lenses,
     undistorted,
 )
@@ -143,7 +143,9 @@ def fit_model(
             raise
         result, notes = absorbed, (note, *review_notes(chain, absorbed, refit, options))
     model = result.model if mount == "eye_to_hand" else with_joints_reversed(result.model)
-    report = msgspec.structs.replace(result.report, notes=(*result.report.notes, *notes), untested=untested(chain))
+    report = msgspec.structs.replace(
+        result.report, notes=(*result.report.notes, *notes), untested=untested_properties(chain)
+    )
     return completed(CalibrationFit(model, report), trials)
 
 
@@ -278,7 +280,7 @@ def _with_exact_joints(
     def otherwise(cause: CalibrationError, refused: CalibrationFit | None = None) -> CalibrationFit:
         """The fit from other lenses if one explains the data; else raises the cause, of a ``refused`` fit too."""
         free = options.lens in ("auto", FREE_LENS) and not priors and cause.code in OF_LENSES
-        bent = free and (cause.code == "lens_implausible" or lenses_may_bend(chain))
+        bent = free and (cause.code == "lens_implausible" or distortion_is_possible(chain))
         found = others() if bent else None
         if found is None:
             raise cause if refused is None else diagnose_failure(chain, cause, refit, options, refused)
@@ -372,7 +374,7 @@ def _fit(
                 refined = _refined_by_joint_errors(start, bundles, options, rows, beside_scales=beside_scales)
             if refined is not None:
                 start, bundles, components, doubtful = refined
-            elif chi2_within(bundles.final.cost, bundles.final.determined.freedom):
+            elif chi2_within(bundles.final.cost, bundles.final.statistics.freedom):
                 components, chance = likely_errors(rows)
     report_progress("report", 0.95)
     result = build_fit(
@@ -382,7 +384,7 @@ def _fit(
         bundles.inliers,
         ModelFrame(start.zero, bundles.raised.plane),
         FitHistory(
-            (bundles.projective.cost, bundles.projective.determined.freedom),
+            (bundles.projective.cost, bundles.projective.statistics.freedom),
             bundles.raised.notes,
             start.markers_left_out,
         ),
@@ -454,7 +456,7 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = _settled(raised.solution, every, options)
     for _ in range(2 if options.lens == "auto" else 0):
-        wanted = lens_wanted(final)
+        wanted = required_lens_model(final)
         if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
             wanted = FREE_LENS if final.lenses == "none" else FULL_LENS
         if wanted == final.lenses:
@@ -491,7 +493,7 @@ def _components_at_start(start: _Start, beside_scales: bool) -> VarianceComponen
     """
     rig, clean = start.linked.rig, start.clean
     free = solve(rig, clean, "projective", lenses=start.lenses, max_evaluations=1)
-    if chi2_within(free.cost, free.determined.freedom):
+    if chi2_within(free.cost, free.statistics.freedom):
         return None
     # Wrong pixels would count as joint errors; those of a whole stop would not be detected.
     squares = (free.residuals.reshape(-1, 2) ** 2).sum(axis=1)
@@ -563,13 +565,13 @@ def _refined_by_joint_errors(
         )
         before = components
         components = estimate_components(reduced_rows(final, at), scales=False, near=before)
-        if components is not None and components.like(before):
+        if components is not None and components.is_close_to(before):
             components = before
             break
     if components is None or not explains(start.trials, final, inliers, components):
         return None
     refuse_undetermined(final, bundles.raised.notes)
-    doubtful = one_thing_happened(start.trials, final)
+    doubtful = is_single_event(start.trials, final)
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
 
@@ -585,7 +587,7 @@ def _from_other_lenses(trials: TrialData, epoch: int, created: str, options: Fit
     """The first fit, of those from initial lenses over the whole range, that its noise explains and whose lenses
     are plausible; None if there is none.
     """
-    for bend in STARTING_BENDS:
+    for bend in INITIAL_DISTORTIONS:
         try:
             result = _fit(trials, epoch, created, _silent, options, {}, bend).fit
         except (CalibrationError, GeometryError, np.linalg.LinAlgError):

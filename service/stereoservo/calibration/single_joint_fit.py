@@ -37,9 +37,9 @@ DIRECTIONS = np.array(
 """Start directions (26, 3): faces, edges and corners of a cube."""
 
 
-def distant_pairs(apart: BoolArray) -> tuple[IntArray, IntArray]:
-    """First and second stops of the pairs where ``apart`` (k, k) holds, at most ``MAX_PAIRS``, evenly spread."""
-    first, second = np.nonzero(apart)
+def distant_pairs(distant: BoolArray) -> tuple[IntArray, IntArray]:
+    """First and second stops of the pairs where ``distant`` (k, k) holds, at most ``MAX_PAIRS``, evenly spread."""
+    first, second = np.nonzero(distant)
     if len(first) <= MAX_PAIRS:
         return first, second
     # Multiples of the golden section spread evenly over the list and contain all steps between stops about equally.
@@ -135,7 +135,7 @@ def nominal_generator(
     return best
 
 
-def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray]:
+def rotation_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray]:
     """Generators (4, 4) of rotations about ``DIRECTIONS``, assuming the nominal cameras: each moves the
     markers' centroid along the trial's chord.
 
@@ -153,19 +153,19 @@ def turned_generators(points: FloatArray, angles: FloatArray) -> list[FloatArray
     if span < 0.5 * np.ptp(angles):
         return []
     both = valid[k] & valid[n]
-    middles = [euclidean[stop, both, :3].mean(axis=0) for stop in (k, n)]
-    return [np.linalg.inv(upgrade) @ twist_about(one, middles, span) @ upgrade for one in DIRECTIONS]
+    centroids = [euclidean[stop, both, :3].mean(axis=0) for stop in (k, n)]
+    return [np.linalg.inv(upgrade) @ twist_about(one, centroids, span) @ upgrade for one in DIRECTIONS]
 
 
-def twist_about(direction: FloatArray, middles: Sequence[FloatArray], span: float) -> FloatArray:
+def twist_about(direction: FloatArray, centroids: Sequence[FloatArray], span: float) -> FloatArray:
     """Unit twist (4, 4) about a ``direction`` (3,) that moves the markers' centroid as observed in the trial.
 
     The centre lies on the bisector of the chord, at half its length over tan(θ/2) to the side.
     """
     axis = direction / np.linalg.norm(direction)
-    chord = middles[1] - middles[0]
+    chord = centroids[1] - centroids[0]
     chord = chord - axis * (axis @ chord)
-    centre = 0.5 * (middles[0] + middles[1]) + 0.5 * np.cross(axis, chord) / np.tan(0.5 * span)
+    centre = 0.5 * (centroids[0] + centroids[1]) + 0.5 * np.cross(axis, chord) / np.tan(0.5 * span)
     x, y, z = axis
     twist = np.zeros((4, 4))
     twist[:3, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
@@ -212,7 +212,7 @@ MIN_STOPS = 4
 """Least number of distinct positions with visible markers in a joint's trial."""
 MIN_SHOWN = 2
 """Number of markers that two cameras must see for a stop to count."""
-MIN_SIGHTINGS = 2
+MIN_OBSERVATIONS = 2
 """Number of stops of joint trials at which two cameras must see a marker for it to enter the model."""
 MIN_MARKERS = 3
 """Least number of markers seen in a trial."""
@@ -299,20 +299,20 @@ def trial_stops(
     stops = np.flatnonzero((groups >= 0) & shown)
     distinct = len(np.unique(np.round(positions[stops, joint] / locked[joint])))
     if distinct < MIN_STOPS:
-        lost, strayed = int((own & ~shown).sum()), int((own & (groups < 0)).sum())
+        lost, left_trial = int((own & ~shown).sum()), int((own & (groups < 0)).sum())
         raise CalibrationError(
             "too_few_stops",
             f"joint {name!r}: {distinct} different usable stops; at least {MIN_STOPS} are needed. Of "
             f"{int(own.sum())} stops, {lost} show fewer than {MIN_SHOWN} markers that two cameras agree "
-            f"on, and at {strayed} other joints strayed by more than {locked.max():g}",
+            f"on, and at {left_trial} other joints strayed by more than {locked.max():g}",
             joint=name,
             stops=distinct,
             minimum=MIN_STOPS,
             markers_lost=lost,
-            strayed=strayed,
+            strayed=left_trial,
         )
-    apart = [stops[groups[stops] == group] for group in np.unique(groups[stops])]
-    _check_effect(trials, max(apart, key=lambda own: float(np.ptp(positions[own, joint]))), joint)
+    by_group = [stops[groups[stops] == group] for group in np.unique(groups[stops])]
+    _check_effect(trials, max(by_group, key=lambda own: float(np.ptp(positions[own, joint]))), joint)
     return stops, groups[stops], base
 
 
@@ -466,8 +466,8 @@ def own_trials(
             stops, groups, base = trial_stops(trials, points, joint)
         except CalibrationError:
             continue
-        sights = virtual_markers(trials, points, usable, stops, groups)
-        yield joint, sights, trials.positions[stops, joint] - base[joint]
+        markers = virtual_markers(trials, points, usable, stops, groups)
+        yield joint, markers, trials.positions[stops, joint] - base[joint]
 
 
 def best_single_joint(
@@ -478,7 +478,7 @@ def best_single_joint(
     *,
     thorough: bool = False,
 ) -> tuple[RigModel | None, float]:
-    """Single joint of ``kind`` that best fits the observations ``sights`` at ``angles`` (k,), and its median residual
+    """Single joint of ``kind`` that best fits the ``observations`` at ``angles`` (k,), and its median residual
     [sigmas]; start values are tried until one fits. ``thorough``: unless one fits, or two converge to the same result,
     rotations about axes in all directions are tried, too.
     """
@@ -507,28 +507,28 @@ def best_single_joint(
             if found and found[-1].fits:
                 break
     if thorough and kind == "revolute" and not _is_certain(found):
-        turned: list[_StartResult] = []
-        for generator in turned_generators(observations.points, angles):
-            turned += _solve_from(kind, generator, cameras, observations, data, SHORT)
-        if turned:
-            rig = min(turned, key=lambda one: one.score).rig
+        rotated: list[_StartResult] = []
+        for generator in rotation_generators(observations.points, angles):
+            rotated += _solve_from(kind, generator, cameras, observations, data, SHORT)
+        if rotated:
+            rig = min(rotated, key=lambda one: one.score).rig
             found += _solve_from(kind, rig.generators[0], cameras, observations, data, FULL)
     best = min(found, key=lambda one: one.score, default=None)
-    return (best.rig, best.typical) if best is not None else (None, np.inf)
+    return (best.rig, best.median_residual) if best is not None else (None, np.inf)
 
 
 @dataclass(frozen=True)
 class _StartResult:
-    """Result of a start: ``typical`` median residual and ``score``, that of all pixels, both [sigmas]."""
+    """Result of a start: ``median_residual`` median residual and ``score``, that of all pixels, both [sigmas]."""
 
     rig: RigModel
-    typical: float
+    median_residual: float
     score: float
     converged: bool
 
     @property
     def fits(self) -> bool:
-        return self.typical < GOOD_FIT and self.score < GOOD_FIT
+        return self.median_residual < GOOD_FIT and self.score < GOOD_FIT
 
 
 def _is_certain(found: list[_StartResult]) -> bool:
@@ -653,11 +653,11 @@ def without_rare_markers(
     """Leave out markers that two cameras see at fewer than two stops of joint trials. Raises
     CalibrationError.
     """
-    often = np.isfinite(points[trials.trials >= 0]).all(axis=2).sum(axis=0) >= MIN_SIGHTINGS
+    often = np.isfinite(points[trials.trials >= 0]).all(axis=2).sum(axis=0) >= MIN_OBSERVATIONS
     if int(often.sum()) < MIN_MARKERS:
         raise CalibrationError(
             "too_few_markers",
-            f"two cameras see {int(often.sum())} markers at {MIN_SIGHTINGS} stops or more; at least "
+            f"two cameras see {int(often.sum())} markers at {MIN_OBSERVATIONS} stops or more; at least "
             f"{MIN_MARKERS} are needed",
             markers=int(often.sum()),
             minimum=MIN_MARKERS,

@@ -13,8 +13,8 @@ from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.calibration.moved_cameras import (
+    CameraMotionEstimate,
     Correspondences,
-    Moved,
     model_jacobian,
     parameters_of,
 )
@@ -27,7 +27,7 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 
 TAIL = 1e-6
 """Probability that the views of one static point are classified as views of two points."""
-LEAST_HEIGHT = 1e-3
+LEAST_SCALE = 1e-3
 """Height of a point, relative to its size, below which it counts as at infinity."""
 OPEN = 1e7
 """Condition number of a point's rows above which it is undetermined."""
@@ -76,10 +76,10 @@ def _scene_point(model: CellModel, pixels: FloatArray, sigmas: FloatArray) -> tu
         point = triangulate(matrices, ideal[:, None], sigmas[seen][:, None])[0]
     except GeometryError as broken:
         return str(broken)
-    height = float(point @ model.plane_at_infinity)
-    if not abs(height) > LEAST_HEIGHT * float(np.linalg.norm(point)) * float(np.linalg.norm(model.plane_at_infinity)):
+    scale = float(point @ model.plane_at_infinity)
+    if not abs(scale) > LEAST_SCALE * float(np.linalg.norm(point)) * float(np.linalg.norm(model.plane_at_infinity)):
         return "it is as good as at infinity"
-    point = point / height
+    point = point / scale
     # Three directions that preserve the height.
     chart = np.linalg.svd(model.plane_at_infinity[None])[2][1:].T
     covariance = _covariance(model, seen, matrices, point, pixels, sigmas)
@@ -90,7 +90,7 @@ def _scene_point(model: CellModel, pixels: FloatArray, sigmas: FloatArray) -> tu
         lambda at, x: at + chart @ x,
     )
     found = minimise(fit, point, Limits(settled=SETTLED**2))
-    point, determined = found.state, fit.determined(found.state)
+    point, determined = found.state, fit.statistics(found.state)
     if not np.isfinite(found.cost) or np.linalg.cond(determined.triangle) >= OPEN:
         return "its rays do not tell how far away it is"
     chi2, freedom = determined.cost, determined.freedom
@@ -150,7 +150,9 @@ def _covariance(
         np.tile(np.eye(2), (count, 1, 1)),
     )
     group = tuple(int(c) for c in seen)
-    rows = model_jacobian(model, group, Moved(matrices, np.eye(4)), views, np.zeros((1, len(model.zero))))
+    rows = model_jacobian(
+        model, group, CameraMotionEstimate(matrices, np.eye(4)), views, np.zeros((1, len(model.zero)))
+    )
     rows = rows.reshape(2 * count, parameters_of(model))
     widened: FloatArray = covariance + rows @ model.covariance.covariance @ rows.T
     return widened
@@ -163,7 +165,7 @@ LEAST_PX = 0.3
 SHARE = 0.1
 """... and largest share of the displacement of the marker that moves most."""
 
-STRAYING = 0.25
+MOVING_SIGMAS = 0.25
 """Share of a camera's stops at which a static marker may be displaced, for example behind the arm."""
 
 STOPS = 4
@@ -181,9 +183,9 @@ def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.boo
     mean = known.sum(axis=1) / np.maximum(count, 1)[..., None]
     squares = np.where(seen, ((known - mean[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
     total = np.maximum(seen.sum(axis=(0, 1)), 1)
-    strayed = np.sqrt(squares / total)
+    deviation = np.sqrt(squares / total)
     noise = np.sqrt(2.0 * np.where(seen, sigmas**2, 0.0).sum(axis=(0, 1)) / total)
-    still = (strayed <= np.maximum(NOISE * noise, LEAST_PX)) & (strayed <= SHARE * strayed.max(initial=0.0))
+    still = (deviation <= np.maximum(NOISE * noise, LEAST_PX)) & (deviation <= SHARE * deviation.max(initial=0.0))
     return np.asarray(still & (count.max(axis=0) >= STOPS))
 
 
@@ -203,8 +205,8 @@ def static_observations(
         mean = np.nanmedian(pixels, axis=1)
         sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
     away = np.linalg.norm(pixels - mean[:, None], axis=-1)
-    strays = seen & (away > np.maximum(NOISE * np.sqrt(2.0) * sigma, LEAST_PX)[:, None])
-    moved = (strays.sum(axis=1) > STRAYING * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
+    moving = seen & (away > np.maximum(NOISE * np.sqrt(2.0) * sigma, LEAST_PX)[:, None])
+    moved = (moving.sum(axis=1) > MOVING_SIGMAS * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
     kept = ~moved & seen.any(axis=(0, 1))
     named = tuple(marker for marker, one in zip(ids, moved, strict=True) if one)
     if not kept.any():

@@ -14,7 +14,7 @@ from scipy.stats import f as f_distribution
 from stereoservo.calibration import initial_reconstruction
 from stereoservo.calibration.bundle_adjustment import Solution, generator_noise, solve
 from stereoservo.calibration.least_squares import RobustLoss
-from stereoservo.calibration.lens_estimation import lens_wanted
+from stereoservo.calibration.lens_estimation import required_lens_model
 from stereoservo.calibration.rig_model import Measurements, RigModel, partial_products
 from stereoservo.calibration.single_joint_fit import DIRECTIONS, twist_about
 from stereoservo.calibration.trial_data import CalibrationError
@@ -169,7 +169,7 @@ class StratumSelector:
         if problem:
             self._note(solution, problem)
             # A good fit with undetermined directions, converged along them or not: any other will have them, too.
-            open_ones = solution.determined.rank < solution.charts.size
+            open_ones = solution.statistics.rank < solution.charts.size
             wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
             done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
             self.hopeless = self._close(solution) and (wide or done)
@@ -185,7 +185,7 @@ class StratumSelector:
         if not self._worse(solution, NESTED_TAIL):
             self.tolerable.append((solution, plane))
             return False
-        self.bent = self.bent or lens_wanted(solution) != solution.lenses
+        self.bent = self.bent or required_lens_model(solution) != solution.lenses
         # Two starts at one minimum: the constraints hold only approximately, and there is no better minimum.
         self.hopeless = any(abs(other.cost - solution.cost) < 1e-3 * solution.cost for other, _ in self.reserve)
         self.reserve.append((solution, plane))
@@ -207,7 +207,7 @@ class StratumSelector:
         tolerable, self.tolerable = self.tolerable, []
         return min(tolerable, key=lambda entry: entry[0].cost) if tolerable else None
 
-    def turned(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
+    def with_other_axes(self, data: Measurements) -> tuple[Solution, FloatArray] | None:
         """Bundle from the best one so far, with different axes for single joints, if one is then acceptable."""
         reached = [entry for entry in (*self.reserve, *self.loose, *self.tolerable) if entry[0].converged]
         if not reached:
@@ -230,12 +230,12 @@ class StratumSelector:
         Its covariance is large; predictions are as good as the trials allow.
         """
         projective = solve(self.projective.rig, data, "projective", lenses=self.projective.lenses)
-        if projective.converged and projective.determined.rank == projective.charts.size:
+        if projective.converged and projective.statistics.rank == projective.charts.size:
             return None
         for solution, plane in sorted(self.loose, key=lambda entry: entry[0].cost):
             final = _solve_to_convergence(solution, data)
             deviation = (
-                max(_relative_deviations(final).values()) if final.determined.rank == final.charts.size else np.inf
+                max(_relative_deviations(final).values()) if final.statistics.rank == final.charts.size else np.inf
             )
             if final.converged and deviation <= LOOSE_SPREAD and not self._worse(final, PLAUSIBLE_TAIL, projective):
                 self.notes.append(
@@ -275,14 +275,14 @@ class StratumSelector:
         else:
             stops, joints = solution.data.offsets.shape
             allowed = fewer * float(f_distribution.isf(tail, fewer, max(stops // joints - 3, 1)))
-        return solution.cost - beside.cost > allowed * max(1.0, beside.determined.variance)
+        return solution.cost - beside.cost > allowed * max(1.0, beside.statistics.variance)
 
     def _close(self, solution: Solution) -> bool:
-        beside = max(1.0, self.projective.determined.variance)
-        return solution.determined.variance <= self.options.metric_loss * beside
+        beside = max(1.0, self.projective.statistics.variance)
+        return solution.statistics.variance <= self.options.metric_loss * beside
 
     def _unidentified(self, solution: Solution) -> str:
-        rank = solution.determined.rank
+        rank = solution.statistics.rank
         if rank < solution.charts.size:
             return f"the trials determine {rank} of {solution.charts.size} parameters"
         limit = self.options.max_spread
@@ -311,8 +311,8 @@ def _solve_to_convergence(solution: Solution, data: Measurements) -> Solution:
 
 def _relative_deviations(solution: Solution) -> dict[str, float]:
     """Largest relative standard deviation of depths and, in the metric stratum, of focal lengths."""
-    factor = max(1.0, solution.determined.variance)
-    deviations = np.sqrt((solution.determined.root**2).sum(axis=1) * factor)
+    factor = max(1.0, solution.statistics.variance)
+    deviations = np.sqrt((solution.statistics.root**2).sum(axis=1) * factor)
     m = len(solution.rig.points)
     scale = np.array([basis[2, 2] for basis in solution.charts.points])
     depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
@@ -380,7 +380,7 @@ def select_stratum(solution: Solution, data: Measurements, options: FitOptions) 
             return StratumSelection(metric, plane, (), False)
         if selector.hopeless:
             break
-    done = selector.finished(data) or selector.turned(data) or selector.best_tolerable()
+    done = selector.finished(data) or selector.with_other_axes(data) or selector.best_tolerable()
     if done is not None:
         return StratumSelection(*done, (), False)
     second = selector.second_best(unique and _several_directions(solution.rig, finite[0], noise))

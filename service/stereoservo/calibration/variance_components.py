@@ -66,8 +66,8 @@ def readings(offsets: FloatArray) -> Readings:
     places = np.empty(offsets.shape, dtype=np.int64)
     for joint, values in enumerate(offsets.T):
         order = np.argsort(values, kind="stable")
-        apart = np.diff(values[order]) > min(SAME_READING, SAME_SHARE * float(np.ptp(values)))
-        places[order, joint] = np.concatenate([[0], np.cumsum(apart)])
+        distinct = np.diff(values[order]) > min(SAME_READING, SAME_SHARE * float(np.ptp(values)))
+        places[order, joint] = np.concatenate([[0], np.cumsum(distinct)])
     at_zero = posture_correlation(offsets, np.zeros((1, offsets.shape[1])))
     values, vectors = np.linalg.eigh(posture_correlation(offsets, offsets) - at_zero @ at_zero.T)
     kept = values > LEAST_FEATURE * max(float(values[-1]), LEAST_FEATURE)
@@ -131,7 +131,7 @@ class VarianceComponents:
         variance = np.maximum(np.diag(self.covariance)[2 * n :], 0.0)
         return np.where(self.posture > 0.0, _stated(self.posture, variance), 0.0)
 
-    def like(self, other: VarianceComponents) -> bool:
+    def is_close_to(self, other: VarianceComponents) -> bool:
         """Whether the joints' errors equal those of another estimate, to a tenth of their standard deviations."""
         off = np.concatenate(
             [self.random - other.random, self.repeatable - other.repeatable, self.posture - other.posture]
@@ -145,8 +145,8 @@ class VarianceComponents:
 
 def _stated(variances: FloatArray, spreads: FloatArray) -> FloatArray:
     """Standard deviations (n,) of errors whose estimated ``variances`` (n,) have variance ``spreads`` (n,)."""
-    share = np.minimum(spreads, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
-    return np.sqrt(np.maximum(variances / (1.0 - share), NONE_SEEN * np.sqrt(spreads)))
+    relative_variance = np.minimum(spreads, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
+    return np.sqrt(np.maximum(variances / (1.0 - relative_variance), NONE_SEEN * np.sqrt(spreads)))
 
 
 def joint_noise_of(random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings) -> JointNoise:
@@ -285,12 +285,12 @@ def _condensed(reduced: ReducedRows) -> ReducedRows:
     sizes[: len(values)] = values
     fixed = sizes > FIXED
     known, ahead = int(fixed.sum()), left.T @ beside[:first]
-    turned = reduced.X[first:] @ right.T
-    moved = turned[:, fixed] / sizes[fixed]
+    rotated = reduced.X[first:] @ right.T
+    moved = rotated[:, fixed] / sizes[fixed]
     below = beside[first:] - moved @ ahead[:known]
     weak = len(values) - known
     rows = np.vstack([ahead[known : known + weak], below])
-    X = np.vstack([np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), turned[:, ~fixed]])
+    X = np.vstack([np.diag(sizes[known : known + weak], 0) @ np.eye(weak, len(sizes) - known), rotated[:, ~fixed]])
     pixels = np.eye(len(rows))
     pixels[weak:, weak:] += moved @ moved.T
     slopes = np.vstack([np.zeros((weak, reduced.joints)), reduced.slopes[first:]])
@@ -316,9 +316,9 @@ class _Likelihood:
         matrix = variances[0] * reduced.pixels
         for joint in np.flatnonzero(variances[1:].reshape(3, n).any(axis=0)):
             slopes = reduced.slopes[first:, joint]
-            places, courses = reduced.shared(int(joint))
+            places, features = reduced.shared(int(joint))
             own, repeatable, posture = variances[1 + joint :: n]
-            errors = repeatable * places @ places.T + posture * courses @ courses.T
+            errors = repeatable * places @ places.T + posture * features @ features.T
             errors[np.diag_indices(len(errors))] += own
             errors = np.repeat(np.repeat(errors, counts, axis=0), counts, axis=1)
             matrix[first:, first:] += slopes[:, None] * slopes * errors
@@ -387,13 +387,13 @@ def _maximised(reduced: ReducedRows, X: FloatArray, start: FloatArray) -> tuple[
         step = np.zeros_like(score)
         step[free] = np.linalg.pinv(scaled[np.ix_(free, free)], rcond=1e-8) @ (score / size)[free] / size[free]
         better = None
-        for share in (1.0, 0.5, 0.2):
-            tried = np.maximum(here.variances + share * step, 0.0)
+        for fraction in (1.0, 0.5, 0.2):
+            tried = np.maximum(here.variances + fraction * step, 0.0)
             if tried[0] <= 0.1 * here.variances[0]:
                 continue
-            there = _Likelihood(reduced, X, tried)
-            if there.value > here.value:
-                better = there
+            trial = _Likelihood(reduced, X, tried)
+            if trial.value > here.value:
+                better = trial
                 break
         if better is None:
             better = _Likelihood(reduced, X, here.variances * factors)
@@ -445,9 +445,9 @@ def estimate_components(
     score, information, _ = none.score()
     if screened and not (score[1:] > SCREEN * np.sqrt(np.maximum(np.diag(information)[1:], 0.0))).any():
         return None
-    there = np.diag(information)[1:] > 0.0
+    identifiable = np.diag(information)[1:] > 0.0
     guess = np.zeros(3 * n)
-    guess[there] = pixels / _mean_squares(reduced)[there]
+    guess[identifiable] = pixels / _mean_squares(reduced)[identifiable]
     first = np.append(min(pixels, 1.0), guess)
     if near is not None:
         first = np.concatenate([[near.pixels], near.random, near.repeatable, near.posture])

@@ -21,7 +21,7 @@ from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.denavit_hartenberg import DH_HEAD, ReadOutError, denavit_hartenberg, dh_cells
+from stereoservo.kinematics.denavit_hartenberg import DH_HEADER, ReadOutError, denavit_hartenberg, dh_cells
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
 from stereoservo.messages.cell_file import CellFile, load_cell_file
@@ -190,7 +190,7 @@ def _export_model(file: Path, urdf: Path | None, dh: bool, length: str, cell_pat
         if dh:
             rows = denavit_hartenberg(model, known)
             told["denavit_hartenberg"] = msgspec.to_builtins(rows)
-            lines += [" | ".join(cells) for cells in (DH_HEAD, *(dh_cells(row) for row in rows))]
+            lines += [" | ".join(cells) for cells in (DH_HEADER, *(dh_cells(row) for row in rows))]
             from stereoservo.kinematics.inverse.recognition import structure  # statistics: only for this
 
             holds = structure(model)

@@ -18,7 +18,7 @@ from stereoservo.messages.goals import JointTarget
 from stereoservo.messages.wire import FeaturesMessage
 
 if TYPE_CHECKING:
-    from stereoservo.kinematics.joint_angles import JointZeros, TellingMotion
+    from stereoservo.kinematics.joint_angles import DistinguishingMotion, JointZeros
     from stereoservo.numerics.arrays import FloatArray
 
 SPEED = 0.5
@@ -162,13 +162,13 @@ def _estimate_zeros(arm: LearntArm, observations: list[Observation]) -> JointZer
     import numpy as np
 
     from stereoservo.kinematics.joint_angles import joint_zeros
-    from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
+    from stereoservo.kinematics.joint_reprojection import JointAnglesError, observed_chain
 
     pixels, sigmas = np.array([look.pixels for look in observations]), np.array([look.sigmas for look in observations])
     readings = np.array([look.readings for look in observations])
     check = f"`stereoservo calibrate {arm.cell.cell.name} --check`"
     try:
-        found = joint_zeros(seen_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
+        found = joint_zeros(observed_chain(arm.model), arm.model.marker_points, pixels, sigmas, readings)
     except JointAnglesError as error:
         other = f"; zeros alone do not explain them: {check} looks for other causes"
         told = f"the pictures do not tell the joints' zeros: {error}"
@@ -199,17 +199,17 @@ def _beyond_limits(arm: LearntArm, readings: FloatArray, found: JointZeros) -> l
     ]
 
 
-def _informative_motion(arm: LearntArm, look: Observation, found: JointZeros) -> TellingMotion | None:
+def _informative_motion(arm: LearntArm, look: Observation, found: JointZeros) -> DistinguishingMotion | None:
     """Motion that distinguishes the possible postures of an observation; None if one remains, or no motion does."""
     import numpy as np
 
-    from stereoservo.kinematics.joint_angles import telling_motion
+    from stereoservo.kinematics.joint_angles import distinguishing_motion
 
     if not found.alternatives:
         return None
     postures = look.readings + np.array([found.offset, *found.alternatives])
     least_px = LEAST_DIFFERENCE_PX + _tolerance_px(arm)
-    return telling_motion(arm.model, postures, look.readings, arm.limits, PROBE, least_px)
+    return distinguishing_motion(arm.model, postures, look.readings, arm.limits, PROBE, least_px)
 
 
 def _zeros_hold(found: JointZeros) -> bool:
@@ -227,9 +227,9 @@ def _distance_from_home_px(arm: LearntArm, look: Observation, target: FloatArray
     """Largest distance [px] of a marker from its position predicted by the model for the home posture."""
     import numpy as np
 
-    from stereoservo.kinematics.joint_reprojection import predicted_pixels, seen_chain
+    from stereoservo.kinematics.joint_reprojection import observed_chain, predicted_pixels
 
-    wanted = predicted_pixels(seen_chain(arm.model), target[None], arm.model.marker_points)[0]
+    wanted = predicted_pixels(observed_chain(arm.model), target[None], arm.model.marker_points)[0]
     return float(np.nanmax(np.linalg.norm(look.pixels - wanted, axis=-1)))
 
 
@@ -245,7 +245,7 @@ def _report(
     arm: LearntArm,
     observations: list[Observation],
     found: JointZeros,
-    telling: TellingMotion | None,
+    telling: DistinguishingMotion | None,
     error_px: float,
     check: bool,
     as_json: bool,
@@ -306,7 +306,11 @@ def _told(arm: LearntArm, rows: list[dict[str, Any]]) -> list[str]:
 
 
 def _undecided(
-    arm: LearntArm, rows: list[dict[str, Any]], postures: list[list[float]], telling: TellingMotion | None, right: bool
+    arm: LearntArm,
+    rows: list[dict[str, Any]],
+    postures: list[list[float]],
+    telling: DistinguishingMotion | None,
+    right: bool,
 ) -> list[str]:
     """Lines on an observation that several postures explain."""
     lines = [
@@ -328,7 +332,7 @@ def _undecided(
         joint, unit = rows[telling.joint]["joint"], _units(arm)[telling.joint]
         most = len(postures) * (len(postures) - 1) // 2
         lines.append(
-            f"a motion of {joint} by {telling.step:+.2f} {unit} tells {telling.told} of {most} pairs of them apart, by "
-            f"{telling.pixels:.1f} px or more: `{command}` makes it and looks again"
+            f"a motion of {joint} by {telling.step:+.2f} {unit} tells {telling.distinguished} of {most} pairs "
+            f"of them apart, by {telling.pixels:.1f} px or more: `{command}` makes it and looks again"
         )
     return lines

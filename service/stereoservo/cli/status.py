@@ -52,7 +52,7 @@ def with_progress(state: StateMessage, directories: CellDirectories) -> StateMes
     """A state whose reason ``COMPILING`` has the number of compiled kernels, on the cell's own host."""
     compiling = [one for one in read_progress(directories.runtime) if one.part == "rest"]
     reasons = tuple(
-        msgspec.structs.replace(reason, hint=f"{compiling[0].words} are compiled. {reason.hint}")
+        msgspec.structs.replace(reason, hint=f"{compiling[0].text} are compiled. {reason.hint}")
         if compiling and reason.code == "COMPILING"
         else reason
         for reason in state.reasons

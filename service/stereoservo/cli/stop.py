@@ -9,7 +9,7 @@ import typer
 from stereoservo.cli.early_stop import RaisedStop
 from stereoservo.cli.output import CellArgument, CommandError, EndpointOption, JsonOption, emit
 from stereoservo.client import Client
-from stereoservo.messages.discovery import daemon_info, last_words
+from stereoservo.messages.discovery import daemon_info, unreachable_reason
 from stereoservo.messages.locks import holder
 from stereoservo.messages.wire import Reply
 
@@ -47,7 +47,7 @@ def _await_acknowledgement(raised: RaisedStop) -> None:
             why = (
                 f"the servo process did not acknowledge it within {ACKNOWLEDGE_S:g} s: it hangs"
                 if runs
-                else f"no servo process runs. {last_words(raised.directories)}".rstrip(". ")
+                else f"no servo process runs. {unreachable_reason(raised.directories)}".rstrip(". ")
             )
             raise CommandError("not_acknowledged", f"after raising the stop slot: {why}. {NOT_TAKEN}")
         time.sleep(0.005)

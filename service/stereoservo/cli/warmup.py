@@ -17,7 +17,7 @@ from stereoservo.cli.output import CommandError, JsonOption, emit, log, shipped_
 from stereoservo.daemon.process_control import child_environment
 from stereoservo.messages.compilation_progress import CompilationProgress, read_progress
 from stereoservo.messages.directories import cell_directories
-from stereoservo.messages.discovery import TELL_EVERY_S
+from stereoservo.messages.discovery import REPORT_EVERY_S
 
 
 def warmup(
@@ -58,12 +58,12 @@ def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
     known: tuple[CompilationProgress, ...] = ()
     while True:
         try:
-            return process.wait(TELL_EVERY_S)
+            return process.wait(REPORT_EVERY_S)
         except subprocess.TimeoutExpired:
             progress = read_progress(told)
         if progress != known:
             known = progress
-            log(f"compiling: {progress[0].words}")
+            log(f"compiling: {progress[0].text}")
 
 
 def _warm_up_detectors(cell: str) -> None:

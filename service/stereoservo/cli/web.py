@@ -73,11 +73,11 @@ def web(
         raise CommandError(
             "missing", "the page needs the package websockets: pip install 'stereoservo[web]'"
         ) from error
-    make_link: Callable[[Publish], CellLink | FlightLink]
+    make_link: Callable[[Publish], CellLink | PlaybackLink]
     if flight is not None:
-        from stereoservo.web.flight_link import FlightLink
+        from stereoservo.web.playback import PlaybackLink
 
-        make_link = partial(FlightLink, flight)
+        make_link = partial(PlaybackLink, flight)
     else:
         assert cell is not None
         make_link = partial(CellLink, cell, endpoint, operate or "page", log=log)

@@ -38,9 +38,7 @@ class EventWatch:
         while (sample := self._subscriber.try_recv()) is not None:
             event = read_message(str(sample.key_expr), sample.payload.to_bytes(), EventMessage)
             if event.boot != self._boot:
-                raise DaemonLostError(
-                    f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state"
-                )
+                raise DaemonLostError(f"the gateway of cell {self._connection.cell!r} was restarted; ask for the state")
             if event.seq > self._next:
                 self._fill(found, event.seq)
             if event.seq == self._next:
@@ -76,7 +74,7 @@ class EventWatch:
         except NoReplyError as error:
             raise DaemonLostError(f"the daemon of cell {self._connection.cell!r} no longer answers") from error
         if boot != self._boot:
-            raise DaemonLostError(f"the gateway of cell {self._connection.cell!r} was started anew; ask for the state")
+            raise DaemonLostError(f"the gateway of cell {self._connection.cell!r} was restarted; ask for the state")
         self._alive = time.monotonic()
 
     def wait(self, wanted: Callable[[EventMessage], bool], what: str, timeout_s: float) -> EventMessage:

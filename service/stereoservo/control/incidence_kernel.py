@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from stereoservo.control.laws.stereo import pixel_gradients
-from stereoservo.kinematics.composition import PresentArm, displace
+from stereoservo.kinematics.composition import CurrentArm, displace
 from stereoservo.kinematics.kernels import transform_points
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import Fields, kernel
@@ -171,7 +171,7 @@ class Decomposition(NamedTuple):
 
 @kernel
 def _linearized(
-    arm: PresentArm, matrices: FloatArray, points: FloatArray, constraints: Constraints, metric: FloatArray
+    arm: CurrentArm, matrices: FloatArray, points: FloatArray, constraints: Constraints, metric: FloatArray
 ) -> tuple[Seen, Linearization]:
     operators, composition = arm
     kinds, markers, fixed, drift = constraints
@@ -264,7 +264,7 @@ def incidence_kernel(
 ) -> tuple[FloatArray, FloatArray, IntArray, int, float, float]:
     """Velocity (n,), error (k,) [px], status (k,), rank, conditioning, reducible share; see `incidence.IncidenceStep`.
 
-    ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4); the fields of a `PresentArm`, of `Constraints`, a `Regulation`
+    ``points`` (m, 4) in cameras ``matrices`` (c, 3, 4); the fields of a `CurrentArm`, of `Constraints`, a `Regulation`
     and a `SecondTask`.
     """
     held, rest = Constraints(*constraints), SecondTask(*second)
@@ -272,7 +272,7 @@ def incidence_kernel(
     n, count = arm[0].shape[0], held.kinds.shape[0]
     velocity = np.zeros(n)
     status = np.zeros(count, dtype=np.int64)
-    seen, linear = _linearized(PresentArm(*arm), matrices, points, held, metric)
+    seen, linear = _linearized(CurrentArm(*arm), matrices, points, held, metric)
     error = linear.error
     if not linear.finite:
         for k in range(count):

@@ -25,7 +25,7 @@ from stereoservo.kinematics.kernels import exp_twist, invert4
 from stereoservo.kinematics.model import CellModel, MarkerGroup
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
-from stereoservo.planning.motion_frame import average_over_turns
+from stereoservo.planning.motion_frame import average_over_rotations
 
 FLAT_PX = 0.05
 """A good ``sigma_px`` for the markers of a calibrated model on plates flat to some tenths of a millimetre.
@@ -287,7 +287,7 @@ def turned_average(information: FloatArray, operators: FloatArray) -> FloatArray
     for _ in range(AVERAGING_ROUNDS):
         for j in range(operators.shape[0]):
             if _turns(operators[j]):
-                average_over_turns(mean, operators[j])
+                average_over_rotations(mean, operators[j])
     return mean
 
 

@@ -94,7 +94,7 @@ class Numbers(ctypes.Structure):
     active: int
     faulty: int
     modelled: int
-    frames_apart: int
+    frames_as_stops: int
     erring: int
     stopped: int
     by_images: int
@@ -200,7 +200,7 @@ class Workspace:
     `ModelArrays`, its lenses of ``lens_size`` numbers; ``joint_deviations`` (n,) of joint readings with errors.
 
     State for this step, written by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's last report
-    and ``active`` with it; ``modelled``: there is a model; ``frames_apart``: Python processes the frames;
+    and ``active`` with it; ``modelled``: there is a model; ``frames_as_stops``: Python processes the frames;
     ``erring``: joints may deviate from their readings; the arm is ``stopped``, ``paused``; what is monitored;
     ``rounds_apart``: Python examines the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
     ``masked`` (m,); for each camera whether its pose is ``unknown`` and the rule for the offset of its stamps

@@ -60,7 +60,7 @@ def estimate(block: Record, room: Record) -> None:
     processes (`take_frames_apart`); then predict the current markers.
     """
     memory, work = block[0], room[0]
-    if work.frames_apart == 0:
+    if work.frames_as_stops == 0:
         for c in range(memory.cameras):
             memory.sightings[c].fresh = False
         for k in range(work.frames):

@@ -78,7 +78,7 @@ def observe(context: StepContext, *, decides: bool) -> int:
     room, block = derived.room, context.state.block
     work, record, space = room.numbers, block.record, room.record
     found = ingest(record, space)
-    if work.frames_apart:
+    if work.frames_as_stops:
         take_frames_apart(context)
     if derived.arrays is None:
         note_frames(record, space)
@@ -273,7 +273,7 @@ def arrange(context: StepContext) -> None:
     work.stopped, work.by_images = state.stopped, kind.by_images
     work.learning = isinstance(state.source, TrialMotion)
     work.rounds_apart = looks_apart(state)
-    work.frames_apart = any(state.mobile) or state.target is not None
+    work.frames_as_stops = any(state.mobile) or state.target is not None
     work.quiet = watching.last == QUIET and watching.verdict == NOISE
     work.paused = paused(state)
     if derived.arrays is not None:

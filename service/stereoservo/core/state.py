@@ -27,7 +27,7 @@ from stereoservo.messages.goals import Goal, Request
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
-from stereoservo.planning.path_search import Planning
+from stereoservo.planning.path_search import PlanningState
 from stereoservo.planning.plan import Plan
 
 STATE_VERSION = 13
@@ -376,7 +376,7 @@ class PlanJob(msgspec.Struct, eq=False, kw_only=True):
     purpose: Purpose
     goal: Goal
     source: ServoGoal | None
-    planning: Planning | None
+    planning: PlanningState | None
     joints: FloatArray
     points: FloatArray
     resolution: GoalResolution | None = None

@@ -713,7 +713,7 @@ def _request() -> PlanRequest:
         camera_centres=eyes,
         points=_of_height_1(start + corners),
         targets=_of_height_1(start + aside + turned),
-        kept=np.ones(4),
+        must_stay_visible=np.ones(4),
         centre=np.append(start, 1.0),
         centre_target=np.append(start + aside, 1.0),
         faces=np.array([[0, 1, 2]]),

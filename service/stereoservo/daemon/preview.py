@@ -71,7 +71,7 @@ class PreviewEncoder:
     """
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
-        self._wanted = SlotReader(directories.preview_wanted_slot(camera), WANTED_LAYOUT)
+        self._wanted = SlotReader(directories.preview_request_slot(camera), WANTED_LAYOUT)
         self._slot = SlotWriter(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
         self._camera = camera
         self._until_ns = 0
@@ -136,7 +136,7 @@ class PreviewRequest:
     """The gateway's side of one camera's preview: requests images, and reads the newest."""
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
-        self._wanted = SlotWriter(directories.preview_wanted_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
+        self._wanted = SlotWriter(directories.preview_request_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
         self._slot = SlotReader(directories.preview_slot(camera), PICTURE_LAYOUT)
 
     def ask(self) -> None:

@@ -50,7 +50,7 @@ from stereoservo.daemon.preview import PICTURE_CAPACITY, PICTURE_LAYOUT, WANTED_
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.messages.cell_file import load_cell_file
-from stereoservo.messages.compilation_progress import PatientWait, read_progress
+from stereoservo.messages.compilation_progress import ProgressTimeout, read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import FileLock, holder
 from stereoservo.messages.run_record import begin_run, end_run, run_is_up
@@ -181,7 +181,7 @@ class Supervisor:
             self.stop()
 
     def _await_ready(self, termination: Termination) -> None:
-        wait = PatientWait(READY_TIMEOUT_S)
+        wait = ProgressTimeout(READY_TIMEOUT_S)
         while not (self.plan.directories.daemon.exists() and self.plan.directories.control_socket.exists()):
             if termination.asked:
                 return
@@ -292,7 +292,7 @@ class ProgressLines:
         if time.monotonic() < self._due_s:
             return
         self._due_s = time.monotonic() + TELL_EVERY_S
-        words = ", ".join(f"{one.part}: {one.words}" for one in read_progress(runtime))
+        words = ", ".join(f"{one.part}: {one.text}" for one in read_progress(runtime))
         if words != self._said:
             self._said = words
             write_log("run", f"compiling kernels for this computer, once ({words})")
@@ -356,7 +356,7 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
         found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))
         found.append((directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT))
         found.append((directories.preview_slot(camera.name), PICTURE_CAPACITY, PICTURE_LAYOUT))
-        found.append((directories.preview_wanted_slot(camera.name), WANTED_BYTES, WANTED_LAYOUT))
+        found.append((directories.preview_request_slot(camera.name), WANTED_BYTES, WANTED_LAYOUT))
     return found
 
 

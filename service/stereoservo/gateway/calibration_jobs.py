@@ -45,7 +45,7 @@ class CalibrationJobs:
         self._job = TrialCollector(settings)
         self._fit: FitJob | None = None
         self._fit_id = ""
-        self._told = False
+        self._reported = False
         self._check: CheckJob | None = None
         self._check_id = ""
         self._handed: tuple[str, CalibrationResult | ZeroReset] | None = None
@@ -71,7 +71,7 @@ class CalibrationJobs:
         if model is not None and (model.epoch == core_epoch or self._link.send_model(model)):
             self.model = model
 
-    def core_event(self, event: Event, *, fresh: bool) -> None:
+    def on_core_event(self, event: Event, *, fresh: bool) -> None:
         """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
         self._job.add(event)
         if event.kind == "calibration_finished" and fresh:
@@ -83,7 +83,7 @@ class CalibrationJobs:
             self._handed = None
             self._failed(goal_id, event.message)
 
-    def take_epoch(self, epoch: int) -> None:
+    def on_model_applied(self, epoch: int) -> None:
         """Handle the core's change to the model of ``epoch``: report it if it is the model that was sent."""
         if self._handed is None or epoch < self._handed[1].epoch:
             return
@@ -109,7 +109,7 @@ class CalibrationJobs:
 
     def _start_fit(self) -> None:
         self.cancel()
-        self._fit_id, self._told = self._job.id, False
+        self._fit_id, self._reported = self._job.id, False
         try:
             epoch = self._models.next_epoch()
             self._fit = FitJob(self._job.trials(), self._models.path(epoch), epoch, self._known_length)
@@ -168,12 +168,12 @@ class CalibrationJobs:
                 progress=step.progress,
                 origin="gateway",
             )
-        if fit.decided and not self._told:
-            self._told = True
+        if fit.decided and not self._reported:
+            self._reported = True
             self._decide(fit)
         if not ended:
             return
-        report = fit.said.get("report")
+        report = fit.output.get("report")
         if report is not None:
             self._log.add(
                 "calibration_report",
@@ -182,8 +182,8 @@ class CalibrationJobs:
                 name=report,
                 origin="gateway",
             )
-        elif "model" in fit.said or "error" in fit.said:
-            cause = fit.said.get("report_error", "its process ended early")
+        elif "model" in fit.output or "error" in fit.output:
+            cause = fit.output.get("report_error", "its process ended early")
             self._log.add(
                 "calibration_report",
                 message=f"no report could be written: {cause}",
@@ -223,11 +223,11 @@ class CalibrationJobs:
             text = "; ".join(part for part in (report.message, report.trend) if part)
             self._log.add("checked", message=text, id=self._check_id, check=report, origin="gateway")
             if check.reset_to is not None:
-                self._take_zeros(check, check.reset_to)
+                self._send_corrected_zeros(check, check.reset_to)
         check.close()
         self._check = None
 
-    def _take_zeros(self, check: CheckJob, path: Path) -> None:
+    def _send_corrected_zeros(self, check: CheckJob, path: Path) -> None:
         try:
             model, reset = check.reset()
         except FitFailedError as error:

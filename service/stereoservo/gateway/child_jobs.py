@@ -59,7 +59,7 @@ class ChildJob:
         os.set_blocking(self._output.fileno(), False)
         self._buffer = b""
         self._boundary = RecordBoundary(f"output of {module}", partial(write_log, "gateway"))
-        self.said: dict[str, Any] = {}
+        self.output: dict[str, Any] = {}
 
     def poll(self) -> Iterator[FitProgress]:
         """Progress printed since the last poll."""
@@ -67,15 +67,15 @@ class ChildJob:
             self._buffer += chunk
         *lines, self._buffer = self._buffer.split(b"\n")
         for line in lines:
-            said: dict[str, Any] = {}
+            message: dict[str, Any] = {}
             step: FitProgress | None = None
             with self._boundary:  # a library may print, too
-                said = msgspec.json.decode(line, type=dict[str, Any])
-                step = msgspec.convert(said, FitProgress) if "progress" in said else None
+                message = msgspec.json.decode(line, type=dict[str, Any])
+                step = msgspec.convert(message, FitProgress) if "progress" in message else None
             if step is not None:
                 yield step
             else:
-                self.said |= said
+                self.output |= message
 
     @property
     def seconds(self) -> float:
@@ -98,14 +98,14 @@ class ChildJob:
 
     def require(self, key: str) -> Any:
         """The value printed under ``key``. Raises FitFailedError with the child's own error or exit status."""
-        if key in self.said:
-            return self.said[key]
-        if failure := self.said.get("error"):
+        if key in self.output:
+            return self.output[key]
+        if failure := self.output.get("error"):
             raise FitFailedError(failure["code"], failure["message"])
         code = self._process.wait()
         self._errors.seek(0)
-        said = self._errors.read().decode(errors="replace").strip()
-        last = said.splitlines()[-1] if said else "no message"
+        errors = self._errors.read().decode(errors="replace").strip()
+        last = errors.splitlines()[-1] if errors else "no message"
         raise FitFailedError("fit_process", f"the process ended with exit code {code}: {last}")
 
     def close(self) -> None:
@@ -142,14 +142,14 @@ class FitJob(ChildJob):
     @property
     def decided(self) -> bool:
         """Whether the model, or the cause of the failure, is available."""
-        return "model" in self.said or "error" in self.said or self.ended
+        return "model" in self.output or "error" in self.output or self.ended
 
     def model(self) -> tuple[CellModel, Acceptance, float]:
         """The model, its notes, and the duration of the fit [s]. Raises FitFailedError, ModelFileError."""
         self.require("model")
         if self._seconds is None:
             self._seconds = self.seconds
-        return load_model(self.model_path), msgspec.convert(self.said["verdict"], Acceptance), self._seconds
+        return load_model(self.model_path), msgspec.convert(self.output["verdict"], Acceptance), self._seconds
 
 
 class CheckJob(ChildJob):
@@ -162,8 +162,8 @@ class CheckJob(ChildJob):
         path = model_path.with_name("check.npz")
         save_trials(check, path)
         self.reset_to = reset_to
-        wanted = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
-        wanted += ["--body-moves"] if body_moves else []
+        reset_arguments = [] if reset_to is None else ["--reset-to", str(reset_to), "--epoch", str(epoch)]
+        reset_arguments += ["--body-moves"] if body_moves else []
         super().__init__(
             "stereoservo.daemon.jobs.check_job",
             str(path),
@@ -171,7 +171,7 @@ class CheckJob(ChildJob):
             str(history),
             "--limit-px",
             repr(limit_px),
-            *wanted,
+            *reset_arguments,
         )
 
     def report(self) -> CheckReport:

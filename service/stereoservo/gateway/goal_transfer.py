@@ -27,10 +27,10 @@ from stereoservo.gateway.point_alignment import (
     TransferError,
     align_features,
     align_points,
-    listed,
     reproject_set_points,
     require_still,
 )
+from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import POINTS_NEEDED, AlignmentFrame, family_between
 from stereoservo.geometry.cameras import project_many
 from stereoservo.geometry.homogeneous import move_points
@@ -57,7 +57,7 @@ def resolve(
 ) -> TransferredGoal:
     """Set-points of a taught goal for the current model and cameras. Raises TransferError."""
     if requested.relative_to is None and not goal.tool:
-        return _as_taught(goal, model)
+        return _recorded_pixels(goal, model)
     if model is None:
         raise TransferError("the cell has no model yet: calibrate first")
     if goal.model is None:
@@ -76,7 +76,7 @@ def resolve(
                 f"{requested.name!r} was taught with model epoch {goal.model.epoch}, the cell has {model.epoch}: send "
                 'it relative to the "workpiece", or to the "cameras"'
             )
-        change, origin = _nothing_moved(), "where it was taught"
+        change, origin = _identity_change(), "where it was taught"
     else:
         change, origin = _common_change(requested, goal, taught, old, new, model, observations, same)
     points, covariance, names = _points_when_taught(goal, taught, old, new, model, observations, same)
@@ -87,11 +87,11 @@ def resolve(
     if requested.relative_to == "cameras" and not goal.tool:
         _require_same_mounting(goal, model, names, moved)
     elif not goal.tool and not same:
-        note += f"; this holds if the marker body has not been mounted anew since model epoch {goal.model.epoch}"
+        note += f"; this holds if the marker body has not been remounted since model epoch {goal.model.epoch}"
     return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
 
 
-def _as_taught(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
+def _recorded_pixels(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:
     """The recorded pixels; those of cameras that were relocalized since are reprojected into the current images.
 
     Relocalization keeps the frame, bit for bit: the goal's points are still those triangulated with the cameras of
@@ -148,7 +148,7 @@ def _same_frame(taught: TaughtModel, model: CellModel) -> bool:
     )
 
 
-def _nothing_moved() -> FrameChange:
+def _identity_change() -> FrameChange:
     return FrameChange(np.eye(4), np.zeros((16, 16)), (), 0.0, 0)
 
 
@@ -259,7 +259,7 @@ def _require_same_mounting(goal: TaughtGoal, model: CellModel, names: list[int],
     if not worst <= MOUNTED_PX:
         raise TransferError(
             f"at the joints of teaching the model puts marker {names[int(away.max(axis=0).argmax())]} {worst:.1f} px "
-            f"from the goal, {MOUNTED_PX:g} px is allowed: the marker body was mounted anew, or the common markers "
+            f"from the goal, {MOUNTED_PX:g} px is allowed: the marker body was remounted, or the common markers "
             "were moved. A goal that survives this is taught with --tool and sent relative to the workpiece"
         )
 
@@ -277,7 +277,8 @@ def _relative_to_cameras(
     if requested.relative_to != "workpiece" or goal.tool or not same:
         raise TransferError(
             "the cameras ride on the arm: goals are carried over relative to the workpiece, without a tool, and with "
-            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); teach anew"
+            f"the model they were taught with (epoch {goal.target.model_epoch}, the cell has {model.epoch}); "
+            "teach them again"
         )
     if requested.lines or requested.planes:
         raise TransferError(

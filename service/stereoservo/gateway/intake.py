@@ -197,7 +197,7 @@ class Intake:
 
     # -- from the core --------------------------------------------------------------------------------------
 
-    def core_reply(self, event: Event) -> None:
+    def on_core_reply(self, event: Event) -> None:
         """Handle the core's reply to a request."""
         pending = self._pending.pop(event.request, None)
         if pending is None:
@@ -231,7 +231,7 @@ class Intake:
         streamed = pending.query is None and isinstance(moved, UpdateGoal)
         self._answer(pending.query, reply, pending.operator, streamed)
 
-    def core_event(self, event: Event) -> None:
+    def on_core_event(self, event: Event) -> None:
         """Handle an event of the core: a goal that ended is removed."""
         if event.kind in TERMINAL:
             self._running.pop(event.id, None)

@@ -63,11 +63,11 @@ class MarkerViews:
             return
         c, rows = self.cameras.index(camera), [self.ids.index(marker) for marker in known]
         ideal = undistort(self.lenses[c], np.array([seen[marker][0] for marker in known]))
-        there = np.flatnonzero(np.isfinite(ideal).all(axis=1))  # others are beyond the lens model's fold
-        bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal[there]))))
-        kept = [rows[k] for k in there]
-        self.pixels[c, kept] = ideal[there]
-        self.sigmas[c, kept] = np.array([seen[known[k]][1] for k in there]) / bend
+        visible = np.flatnonzero(np.isfinite(ideal).all(axis=1))  # others are beyond the lens model's fold
+        bend = np.sqrt(np.abs(np.linalg.det(distortion_jacobian(self.lenses[c], ideal[visible]))))
+        kept = [rows[k] for k in visible]
+        self.pixels[c, kept] = ideal[visible]
+        self.sigmas[c, kept] = np.array([seen[known[k]][1] for k in visible]) / bend
 
     def subset(self, ids: Sequence[int]) -> MarkerViews:
         """The views of some markers, in their order; missing ones are unseen."""

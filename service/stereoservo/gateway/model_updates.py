@@ -71,30 +71,30 @@ class RelocalizationJobs:
         self._model, self._take = model, take
         self._job = RelocalizationPoses()
         self._fit: RelocalizationJob | None = None
-        self._handed: CellModel | None = None
+        self._pending: CellModel | None = None
 
     @property
     def busy(self) -> bool:
         """Whether a new model is being computed."""
         return self._fit is not None
 
-    def core_event(self, event: Event, *, fresh: bool) -> None:
+    def on_core_event(self, event: Event, *, fresh: bool) -> None:
         """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
         if event.kind == "reanchor":
             self._job.add(event)
             if fresh:
                 self._start()
         elif event.kind == "camera_adjusted" and fresh:
-            self._keep_adjusted(event)
+            self._store_adjusted_matrix(event)
 
-    def take_epoch(self, epoch: int) -> None:
+    def on_model_applied(self, epoch: int) -> None:
         """Handle the core's change to the model of ``epoch``."""
-        if self._handed is not None and epoch >= self._handed.epoch:
-            handed, self._handed = self._handed, None
-            if epoch == handed.epoch:
-                self._take(handed)
+        if self._pending is not None and epoch >= self._pending.epoch:
+            applied, self._pending = self._pending, None
+            if epoch == applied.epoch:
+                self._take(applied)
 
-    def _keep_adjusted(self, event: Event) -> None:
+    def _store_adjusted_matrix(self, event: Event) -> None:
         """Store the re-estimated matrix of a mobile camera in the model and in its file."""
         model = self._model()
         if model is None or event.matrix is None or model.epoch != event.epoch:
@@ -136,14 +136,14 @@ class RelocalizationJobs:
         except ModelFileError as error:
             self._refuse(str(error))
         else:
-            self._hand_over(model, report, fit)
+            self._replace_model(model, report, fit)
         fit.close()
 
-    def _hand_over(self, model: CellModel, report: RelocalizationReport, fit: RelocalizationJob) -> None:
+    def _replace_model(self, model: CellModel, report: RelocalizationReport, fit: RelocalizationJob) -> None:
         if not self._link.send_model(model, fit.cameras):
             self._refuse(f"the servo process does not take the model; it is saved as {report.model}")
             return
-        self._handed = model
+        self._pending = model
         self._log.add(
             "reanchor_model",
             message=report.message,
@@ -188,43 +188,43 @@ class RefinementJobs:
         moving = settings.body_moves or any(camera.mobile for camera in settings.cameras)
         self._on = on and not moving
         if on and moving:
-            log.add("warning", message=f"[calibration] refine: {NOT_WHERE_THINGS_MOVE}", origin="gateway")
+            log.add("warning", message=f"[calibration] refine: {NO_REFINEMENT}", origin="gateway")
         self._models, self._link, self._log, self._taught = models, link, log, taught
         self._calibration, self._relocalization, self._running = calibration, relocalization, running
         self._poses = RestPoses(settings)
         self._cameras = frozenset(camera.name for camera in settings.cameras)
         self._due = LEAST_POSES
-        self._undone = False
+        self._restored = False
         self._epoch = 0
         self._job: ChildJob | None = None
         self._found: tuple[CellModel, RefinementReport] | None = None
-        self._handed: tuple[int, int, str] | None = None
+        self._pending: tuple[int, int, str] | None = None
         """Replaced epoch, new epoch, and the message reported once the core uses the new one."""
         self._idle = False
 
-    def take_frame(self, observation: CameraObservation) -> None:
+    def add_frame(self, observation: CameraObservation) -> None:
         """Add a camera's newest observation."""
         if self._on:
             self._poses.add_frame(observation)
 
-    def take_state(self, status: Status) -> None:
+    def on_state(self, status: Status) -> None:
         """Handle the core's newest state: a rest pose, or a condition that ends the collection."""
-        if self._handed is not None and status.model_epoch == self._handed[0]:
+        if self._pending is not None and status.model_epoch == self._pending[0]:
             self._poses.leave()
             return
-        if self._handed is not None:
-            if status.model_epoch == self._handed[1]:
-                self._log.add("refined", message=self._handed[2], accepted=True, origin="gateway")
-            self._handed = None
+        if self._pending is not None:
+            if status.model_epoch == self._pending[1]:
+                self._log.add("refined", message=self._pending[2], accepted=True, origin="gateway")
+            self._pending = None
         self._idle = status.source == "hold" and not status.goal and not status.command.any()
         if not self._on:
             return
         if status.model_epoch != self._epoch:
-            self._forget("")
-            self._epoch, self._due, self._undone = status.model_epoch, LEAST_POSES, False
+            self._drop_poses("")
+            self._epoch, self._due, self._restored = status.model_epoch, LEAST_POSES, False
         health = status.health
         if health.verdict not in ("ok", "unknown") or health.masked or health.reanchoring:
-            self._forget(f"the watch over the model finds {health.verdict}: {health.text}")
+            self._drop_poses(f"the watch over the model finds {health.verdict}: {health.text}")
         elif self._trusted(status):
             self._poses.add_state(status)
         else:
@@ -254,11 +254,11 @@ class RefinementJobs:
             and not any(camera.timing for camera in status.health.cameras.values())
         )
 
-    def _forget(self, why: str) -> None:
+    def _drop_poses(self, why: str) -> None:
         """Drop all poses, and the running refinement."""
         dropped = len(self._poses.poses)
         self._poses.clear()
-        self._due = MOST_POSES + 1 if self._undone else LEAST_POSES
+        self._due = MOST_POSES + 1 if self._restored else LEAST_POSES
         if why and (dropped or self._job is not None):
             self._refuse(f"not refined: {why}. {dropped} rest poses are dropped", "watch")
         self.cancel()
@@ -278,7 +278,7 @@ class RefinementJobs:
                 self._start(model)
         elif self._idle and not self._running().goals:
             (found, report), self._found = self._found, None
-            self._hand_over(model, found, f"{report.message}. {UNDO}")
+            self._replace_model(model, found, f"{report.message}. {UNDO}")
 
     def _start(self, model: CellModel) -> None:
         self._due = 2 * self._due if self._due < MOST_POSES else MOST_POSES + 1
@@ -311,11 +311,11 @@ class RefinementJobs:
             self._refuse(str(error))
         job.close()
 
-    def _hand_over(self, used: CellModel, found: CellModel, why: str) -> bool:
+    def _replace_model(self, used: CellModel, found: CellModel, why: str) -> bool:
         """Replace ``used`` by ``found``, with a new epoch, also for the taught goals. Returns whether that succeeded;
         if not, nothing has changed and the reason is reported.
 
-        The model's file is the commit: after a crash the next start restates the goals by it (`complete_hand_over`).
+        The model's file is the commit: after a crash the next start restates the goals by it (`complete_replacement`).
         """
         epoch = self._models.next_epoch()
         model = msgspec.structs.replace(found, epoch=epoch, in_place_of=used.epoch)
@@ -325,30 +325,30 @@ class RefinementJobs:
             save_model(model, self._models.path(epoch))
             self._taught.refine(used, model)
         except (OSError, ModelFileError) as error:
-            self._refuse(f"model epoch {epoch} cannot be stored: {error}{self._take_back(epoch, before)}")
+            self._refuse(f"model epoch {epoch} cannot be stored: {error}{self._roll_back(epoch, before)}")
             return False
         if not self._link.send_model(model):
             self._refuse(
                 f"the servo process does not take model epoch {epoch}; epoch {used.epoch} stays in use"
-                f"{self._take_back(epoch, before)}"
+                f"{self._roll_back(epoch, before)}"
             )
             return False
         self._epoch, self._calibration.model = epoch, model
-        self._handed = used.epoch, epoch, f"model epoch {epoch}: {why}"
+        self._pending = used.epoch, epoch, f"model epoch {epoch}: {why}"
         return True
 
-    def _take_back(self, epoch: int, goals: dict[str, TaughtGoal]) -> str:
+    def _roll_back(self, epoch: int, goals: dict[str, TaughtGoal]) -> str:
         """Undo a hand-over, deleting the model's file last: while it exists, the next start completes the hand-over.
         Returns a text on what could not be undone.
         """
         try:
-            self._taught.put_back(goals)
+            self._taught.restore_goals(goals)
             self._models.path(epoch).unlink(missing_ok=True)
         except OSError as error:
             return f". Its file stays ({error.strerror}): the next start uses it, with the goals restated in it"
         return ""
 
-    def complete_hand_over(self) -> None:
+    def complete_replacement(self) -> None:
         """Restate the taught goals in the model in use, if a crash prevented it. Called once, at the start."""
         model = self._calibration.model
         if model is None or not model.in_place_of:
@@ -381,17 +381,17 @@ class RefinementJobs:
         busy = self._calibration.busy or self._relocalization.busy
         if busy or not self._idle or self._running().goals:
             raise MessageError("the arm is at work: wait until no goal runs, or cancel it, then undo again")
-        if self._handed is not None:
+        if self._pending is not None:
             raise MessageError(f"refined model epoch {used.epoch} is just being taken in: undo again in a moment")
         base = self._models.of_epoch(used.refined_from)
         if base is None:
-            raise MessageError(f"the file of calibrated model epoch {used.refined_from} is gone: calibrate anew")
+            raise MessageError(f"the file of calibrated model epoch {used.refined_from} is gone: calibrate again")
         self.cancel()
         self._poses.clear()
         text = f"the calibrated model epoch {base.epoch} is back, in place of refined epoch {used.epoch}"
-        if not self._hand_over(used, base, text):
+        if not self._replace_model(used, base, text):
             raise MessageError(f"refined epoch {used.epoch} stays in use; event `refined` says why nothing was undone")
-        self._due, self._undone = MOST_POSES + 1, True
+        self._due, self._restored = MOST_POSES + 1, True
         return text
 
     def _refuse(self, message: str, code: str = "") -> None:
@@ -405,7 +405,7 @@ class RefinementJobs:
 
 
 UNDO = "The calibrated model comes back by `calibrate CELL --undo-refinement`"
-NOT_WHERE_THINGS_MOVE = (
+NO_REFINEMENT = (
     "nothing is refined in a cell whose cameras are mobile or whose marker body moves by itself: what its rest poses "
     "show is not the arm alone"
 )

@@ -59,17 +59,19 @@ class ObservationCache:
     ) -> dict[int, MarkerObservation]:
         if not fresh:
             return {}
-        tracks: dict[int, list[_Sight]] = {}
+        tracks: dict[int, list[_TimedPixel]] = {}
         for observation in fresh:
             since_s = (observation.t_shutter_ns - moment_ns) * 1e-9
             for marker, pixel, covariance in zip(
                 observation.ids, observation.pixels, observation.covariances, strict=True
             ):
-                tracks.setdefault(int(marker), []).append(_Sight(since_s, pixel, 0.5 * float(np.trace(covariance))))
+                tracks.setdefault(int(marker), []).append(
+                    _TimedPixel(since_s, pixel, 0.5 * float(np.trace(covariance)))
+                )
         return {int(marker): _average(tracks[int(marker)], self._systematic[camera] ** 2) for marker in fresh[-1].ids}
 
 
-class _Sight(NamedTuple):
+class _TimedPixel(NamedTuple):
     """Where a marker was seen (2,) [px], with its variance [px²], at a time [s] relative to the reference time."""
 
     since_s: float
@@ -77,14 +79,14 @@ class _Sight(NamedTuple):
     variance: float
 
 
-def _average(track: list[_Sight], systematic: float) -> MarkerObservation:
+def _average(track: list[_TimedPixel], systematic: float) -> MarkerObservation:
     """Mean pixel of a static marker; for a moving one, its pixel at the latest time that all cameras have observed."""
-    pixels = np.array([sight.pixel for sight in track])
-    variance = float(np.mean([sight.variance for sight in track]))
+    pixels = np.array([observed.pixel for observed in track])
+    variance = float(np.mean([observed.variance for observed in track]))
     mean = pixels.mean(axis=0)
     away = float(np.sqrt(((pixels - mean) ** 2).sum(axis=1)).max())
     if away > STILL_SIGMAS * np.sqrt(variance) + STILL_PX:
-        times = np.array([sight.since_s for sight in track])
+        times = np.array([observed.since_s for observed in track])
         order = np.argsort(times, kind="stable")
         u, v = (float(np.interp(0.0, times[order], pixels[order, axis])) for axis in range(2))
         return MarkerObservation((u, v), float(np.sqrt(track[-1].variance)), True)

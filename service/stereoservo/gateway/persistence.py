@@ -36,7 +36,7 @@ from stereoservo.messages.wire import EventMessage
 JOURNAL_BYTES = 10_000_000
 REOPEN_S = 1.0
 """Interval of attempts to open a journal that could not be opened [s]."""
-Tell = Callable[[str, str], None]
+SetNote = Callable[[str, str], None]
 """Called with the topic and the text of a note for the cell's keeper."""
 
 
@@ -47,7 +47,7 @@ class TaughtStore:
     it is, and TaughtFileError is raised.
     """
 
-    def __init__(self, path: Path, model_of: ModelOf = lambda _: None, recover: Tell | None = None) -> None:
+    def __init__(self, path: Path, model_of: ModelOf = lambda _: None, recover: SetNote | None = None) -> None:
         self._path = path
         self.goals: dict[str, TaughtGoal] = {}
         try:
@@ -70,9 +70,9 @@ class TaughtStore:
         """Restate the goals in ``model`` instead of ``used``, if only the estimate changed (see `refined_goal`). Raises
         OSError if they cannot be stored; they are then restated in memory.
         """
-        self.put_back({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
+        self.restore_goals({name: refined_goal(goal, used, model) for name, goal in self.goals.items()})
 
-    def put_back(self, goals: dict[str, TaughtGoal]) -> None:
+    def restore_goals(self, goals: dict[str, TaughtGoal]) -> None:
         """Set ``goals`` in memory, and write the file if it holds others. Raises OSError."""
         self.goals = goals
         try:
@@ -232,7 +232,7 @@ class Journal:
 
 _HANDLED_LAYOUT = "HandledEvents.1"
 _HANDLED = struct.Struct("=qq")
-AGAIN_S = 1.0
+RETRY_S = 1.0
 """Interval of attempts to write goals that could not be written [s]."""
 BEGINS = frozenset({"goal_accepted", "goal_started", "calibration_progress"})
 ENDS = frozenset({*TERMINAL, "calibration_finished", "calibration_aborted", "check_finished"})
@@ -272,7 +272,7 @@ class OpenGoalRecord:
         try:
             write_goals(self._directories, tuple(self._goals.values()))
         except OSError as error:  # a full disk: goals continue, and end, nevertheless
-            self._due_s = time.monotonic() + AGAIN_S
+            self._due_s = time.monotonic() + RETRY_S
             if not again:
                 write_log("gateway", f"{self._directories.open_goals}: {error.strerror}")
 
@@ -306,7 +306,7 @@ class HandledEvents:
     all events before this start count as handled. Raises SlotError.
     """
 
-    def __init__(self, path: Path, tell: Tell) -> None:
+    def __init__(self, path: Path, set_note: SetNote) -> None:
         existed = path.exists()
         self._slot = SlotWriter(path, _HANDLED.size, _HANDLED_LAYOUT)
         with SlotReader(path, _HANDLED_LAYOUT) as reader:
@@ -318,9 +318,9 @@ class HandledEvents:
         self._write()
         if existed:
             self._not_before_ns = time.monotonic_ns()
-            tell(
+            set_note(
                 "handled events",
-                f"{path}: was damaged and begins anew. What was taught or calibrated in the moment before the "
+                f"{path}: was damaged and is started empty. What was taught or calibrated in the moment before the "
                 "gateway's start may be missing: look, and repeat it",
             )
 

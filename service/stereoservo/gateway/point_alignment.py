@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.gateway.marker_views import MarkerViews, observed_views
 from stereoservo.gateway.observation_cache import MarkerObservations
+from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import AlignmentFrame, Family, align, point_residuals, reprojected
 from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.incidence_alignment import MixedFeatures, align_incidences
@@ -155,11 +156,6 @@ def reproject_set_points(
     return found, known, f"set-points known to {worst:.2f} px{left}"
 
 
-def listed(markers: Iterable[object]) -> str:
-    """Markers as text, separated by commas."""
-    return ", ".join(str(marker) for marker in markers) or "none"
-
-
 # -- edges and faces --
 
 SEGMENT_PX = 0.5
@@ -283,7 +279,7 @@ def _require_seen(features: CommonFeatures, views: MarkerViews, when: str) -> No
 
     def cameras(ids: Iterable[int]) -> list[str]:
         rows = [views.ids.index(marker) for marker in ids]
-        return [name for name, there in zip(views.cameras, seen[:, rows], strict=True) if bool(there.all())]
+        return [name for name, visible in zip(views.cameras, seen[:, rows], strict=True) if bool(visible.all())]
 
     named: list[tuple[str, Sequence[int]]] = [(f"point {marker}", (marker,)) for marker in features.points]
     named += [(f"edge {a}-{b}", (a, b)) for a, b in features.lines]

@@ -51,7 +51,7 @@ from stereoservo.gateway.persistence import HandledEvents, Journal, ModelStore, 
 from stereoservo.gateway.publisher import (
     SILENT,
     EventLog,
-    KeeperNotes,
+    OperatorNotes,
     Previews,
     Publishers,
     ReplyThread,
@@ -106,7 +106,7 @@ FINAL_PASSES = 100
 LAST_EVENTS_S = 3.0
 """Time to wait for the last events of a servo process whose supervisor was killed: it stops the arm before it ends."""
 DRAIN = 32
-ANNOUNCE_AGAIN_S = 1.0
+ANNOUNCE_RETRY_S = 1.0
 EXIT_SETUP = 3
 ONCE = frozenset({"taught", "calibration_finished", "check_finished", "reanchor", "camera_adjusted", "fault"})
 """Events of the core whose effects must not happen twice."""
@@ -140,7 +140,7 @@ class Gateway:
         self._publishers = Publishers(self._session, self.keys, cameras)
         self.goals = OpenGoalRecord(directories, plan.boot)
         self.log = EventLog(self.boot, self._publish_event, self._observe_event)
-        self._notes = KeeperNotes(self.log, plan.joints.notes)
+        self._notes = OperatorNotes(self.log, plan.joints.notes)
         self._servo = ServoConnection(directories)
         self._replies = ReplyThread()
         self._calibration = CalibrationJobs(
@@ -155,7 +155,7 @@ class Gateway:
             self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
         )
         self._marker_cache = ObservationCache({camera.name: camera.systematic_px for camera in self.settings.cameras})
-        taught = TaughtStore(directories.taught, self._models.of_epoch, self._notes.tell)
+        taught = TaughtStore(directories.taught, self._models.of_epoch, self._notes.set_note)
         self._teaching = TaughtGoalRegistry(taught, self._marker_cache, lambda: self._calibration.model, self.log)
         self._intake = Intake(self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot)
         self._refinement = RefinementJobs(
@@ -171,10 +171,10 @@ class Gateway:
         self._declare()
         self._stop = StopThread(stop_config(plan.cell, cell_dir, directories.zenoh_socket), self.keys, plan, self.boot)
         self._state = CellState(plan, self.boot, self._servo)
-        self._state_sent = self._steps_taken = 0.0
-        self._recordings = Recordings(plan, self.log, self._notes.tell)
+        self._state_sent = self._steps_recorded = 0.0
+        self._recordings = Recordings(plan, self.log, self._notes.set_note)
         self._servo.records = self._recordings.wants_steps
-        self._handled = HandledEvents(directories.runtime / "handled.slot", self._notes.tell)
+        self._handled = HandledEvents(directories.runtime / "handled.slot", self._notes.set_note)
         self._greeted = False
         self._announce_due_s: float | None = 0.0
         self._heartbeat = HeartbeatWriter(directories.heartbeat_slot("gateway"))
@@ -182,7 +182,7 @@ class Gateway:
         self.goals.end_earlier(self.log)
         run = read_run(directories)
         if run is not None and run.boot == plan.boot and run.previous:
-            self._notes.tell("run before", f"the run before this one ended: {run.previous}")
+            self._notes.set_note("run before", f"the run before this one ended: {run.previous}")
 
     def _declare(self) -> None:
         session, keys = self._session, self.keys
@@ -249,21 +249,21 @@ class Gateway:
         if self._servo.connected and self._state.newest is not None and not self._greeted:
             self._greeted = True
             self._calibration.load(self._state.newest.status.model_epoch)
-            self._refinement.complete_hand_over()
+            self._refinement.complete_replacement()
         events = self._servo.events()
         if events:  # a client that receives an event finds no older state
             self._read_state()
         for event in events:
-            self._core_event(event)
+            self._on_core_event(event)
         self._intake.expire()  # after the answers that arrived while this process was suspended
         busy = self._queries() or bool(events)
         self._publish_features()
         with self._preview_boundary:
             self._previews.poll()
         self._publish_state()
-        self._reports.poll(self._take_report)
-        if time.monotonic() - self._steps_taken >= STEPS_EVERY_S:
-            self._take_steps()
+        self._reports.poll(self._on_report)
+        if time.monotonic() - self._steps_recorded >= STEPS_EVERY_S:
+            self._record_steps()
         self._recordings.poll()
         self.goals.poll()
         self._calibration.poll()
@@ -274,8 +274,8 @@ class Gateway:
             self._heartbeat.beat(GATEWAY_HANG_S)
         return busy
 
-    def _take_steps(self, limit: int = 512) -> None:
-        self._steps_taken = time.monotonic()
+    def _record_steps(self, limit: int = 512) -> None:
+        self._steps_recorded = time.monotonic()
         for item in self._servo.steps(limit):
             self._recordings.take(item)
         if self._recordings.refused:  # the next request to record starts a new one
@@ -333,7 +333,7 @@ class Gateway:
                 self._recordings.want_images()
         except CannotRecordError as error:
             return Reply(False, "there are no images to record", problems=(str(error),), boot=self.boot)
-        self._take_steps()  # earlier ones belong to the recording so far
+        self._record_steps()  # earlier ones belong to the recording so far
         if not request.on:
             text = self._recordings.stop()
             self._servo.records = self._recordings.wants_steps
@@ -382,9 +382,9 @@ class Gateway:
 
     # -- events of the core --------------------------------------------------------------------------------
 
-    def _core_event(self, event: Event) -> None:
+    def _on_core_event(self, event: Event) -> None:
         if event.kind == "reply":
-            self._intake.core_reply(event)
+            self._intake.on_core_reply(event)
         missed = self._handled.missed_before(event)
         if missed:
             text = f"{missed} events of the servo process are lost: no gateway took them while they were kept"
@@ -392,19 +392,19 @@ class Gateway:
         if event.kind in SILENT:
             self._handled.mark(event, acted=False)
             return
-        self._intake.core_event(event)
+        self._intake.on_core_event(event)
         # A restarted gateway receives the servo process's events again.
         fresh = not self._handled.is_acted_on(event)
         self._repeated = self._handled.is_journaled(event)
         operator = self._stop.stopped_by(event.t_ns) if event.kind == "stopped" else ""
-        self._state.take_event(event, operator, repeated=self._repeated)
+        self._state.on_event(event, operator, repeated=self._repeated)
         if event.kind != "taught" or not fresh or self._teaching.taught(event):
             self.log.add_core(event, operator=operator)
         self._repeated = False
         if event.kind == "fault" and fresh:
             self._recordings.keep_ring(event.t_ns)
-        self._calibration.core_event(event, fresh=fresh)
-        self._relocalization.core_event(event, fresh=fresh)
+        self._calibration.on_core_event(event, fresh=fresh)
+        self._relocalization.on_core_event(event, fresh=fresh)
         self._handled.mark(event, acted=event.kind in ONCE)
 
     # -- telling --------------------------------------------------------------------------------------------
@@ -418,16 +418,16 @@ class Gateway:
                 observation = decode_observation(data)
                 publisher = self._publishers.features[observation.camera]
                 self._marker_cache.add(observation)
-                self._refinement.take_frame(observation)
+                self._refinement.add_frame(observation)
                 if publisher.matching_status.matching:
                     publisher.put(encode(features_message(observation)))
 
     def _read_state(self) -> None:
         state = self._state.read()
         if state is not None:
-            self._calibration.take_epoch(state.status.model_epoch)
-            self._relocalization.take_epoch(state.status.model_epoch)
-            self._refinement.take_state(state.status)
+            self._calibration.on_model_applied(state.status.model_epoch)
+            self._relocalization.on_model_applied(state.status.model_epoch)
+            self._refinement.on_state(state.status)
 
     def _newest_message(self) -> StateMessage | None:
         """The current state; None before the first one."""
@@ -442,13 +442,13 @@ class Gateway:
 
     def _collect_notes(self) -> None:
         """Update the notes on omitted messages and lines."""
-        self._notes.tell("journal", self._journal.note)
-        self._notes.tell("servo process", self._servo.note)
-        self._notes.tell("reports", self._reports.note)
+        self._notes.set_note("journal", self._journal.note)
+        self._notes.set_note("servo process", self._servo.note)
+        self._notes.set_note("reports", self._reports.note)
         beat = self._supervisor.newest()
-        self._notes.tell("supervisor", SUPERVISOR_SILENT if beat is not None and beat.silent_s(0.0) else "")
+        self._notes.set_note("supervisor", SUPERVISOR_SILENT if beat is not None and beat.silent_s(0.0) else "")
         for k, (_, boundary) in enumerate(self._observations):
-            self._notes.tell(f"observations {k}", boundary.note)
+            self._notes.set_note(f"observations {k}", boundary.note)
 
     def _publish_state(self) -> None:
         now = time.monotonic()
@@ -459,7 +459,7 @@ class Gateway:
         if state is not None and self._publishers.state.matching_status.matching:
             self._publishers.state.put(encode(state))
 
-    def _take_report(self, report: Report) -> None:
+    def _on_report(self, report: Report) -> None:
         if report.images is not None:
             self._recordings.images.add_report(report.images)
         self.log.add(report.kind, t_ns=report.t_ns, message=report.message, name=report.origin, origin=report.origin)
@@ -484,20 +484,20 @@ class Gateway:
         try:
             write_atomically(plan.directories.daemon, encode(info))
         except OSError as error:
-            self._announce_due_s = now + ANNOUNCE_AGAIN_S
-            self._notes.tell(
+            self._announce_due_s = now + ANNOUNCE_RETRY_S
+            self._notes.set_note(
                 "announcement", f"{plan.directories.daemon}: {error.strerror}; clients cannot find the daemon"
             )
         else:
             self._announce_due_s = None
-            self._notes.tell("announcement", "")
+            self._notes.set_note("announcement", "")
 
     def close(self) -> None:
         """Finish the recording, cancel the fit, close the sessions within a time limit."""
         self._calibration.cancel()
         self._relocalization.cancel()
         self._refinement.cancel()
-        self._take_steps(100_000)
+        self._record_steps(100_000)
         self._recordings.close()
         with suppress(zenoh.ZError):  # this message is a courtesy, not required
             if not self._servo.connected:  # otherwise the next gateway continues
@@ -532,7 +532,7 @@ class Gateway:
         self._supervisor.close()
 
     @property
-    def owed(self) -> bool:
+    def reply_pending(self) -> bool:
         """Whether the servo process, which ends as well, must still report how a goal ended."""
         return self._servo.connected and self.goals.any_of_this_run
 
@@ -552,7 +552,7 @@ def run(plan: RunPlan, parent: int, termination: Termination) -> None:
             if not gateway.run_once():
                 break
         until = time.monotonic() + LAST_EVENTS_S
-        while os.getppid() != parent and gateway.owed and time.monotonic() < until:
+        while os.getppid() != parent and gateway.reply_pending and time.monotonic() < until:
             gateway.run_once()
             time.sleep(IDLE_S)
     finally:
@@ -602,24 +602,24 @@ class CellState:
             self.newest = state
         return state
 
-    def take_event(self, event: Event, operator: str, *, repeated: bool) -> None:
+    def on_event(self, event: Event, operator: str, *, repeated: bool) -> None:
         """Record who stops or holds the arm. ``operator``: sender of a stop, if known; ``repeated``: sent to an earlier
         gateway, too.
         """
         self._halt.take(event, operator, repeated=repeated)
 
-    def message(self, **told: Any) -> StateMessage | None:
-        """The current state in the clients' format, with the further arguments ``told`` of `state_message`; None before
-        the first state.
+    def message(self, **fields: Any) -> StateMessage | None:
+        """The current state in the clients' format, with the further arguments ``fields`` of `state_message`; None
+        before the first state.
         """
         if self.newest is None:
             return None
-        heard = time.monotonic() - self._heard_s <= SERVO_STALE_S
-        alive = heard or self._servo.announced_silence()
+        servo_alive = time.monotonic() - self._heard_s <= SERVO_STALE_S
+        alive = servo_alive or self._servo.announced_silence()
         state = state_message(
-            self._plan, self._boot, self.newest, now_ns=time.monotonic_ns(), servo_alive=alive, **told
+            self._plan, self._boot, self.newest, now_ns=time.monotonic_ns(), servo_alive=alive, **fields
         )
-        silent = self._cameras.reasons(state) if heard else ()  # a silent servo process receives no frames
+        silent = self._cameras.reasons(state) if servo_alive else ()  # a silent servo process receives no frames
         halted = any(reason.code in ("STOPPED", "HELD") for reason in state.reasons)
         return msgspec.structs.replace(
             state,
@@ -645,15 +645,15 @@ class _Halts:
             self.now, self._stopped = None, False
         elif event.kind == "stopped":
             self._stopped = True
-            self._set(event, _stop_words(event, operator, repeated))
+            self._set(event, _stop_text(event, operator, repeated))
         elif event.kind == "held" and not self._stopped:
             self._set(event, event.message)
 
-    def _set(self, event: Event, words: str) -> None:
-        self.now = Halt(words, time.time() - (time.monotonic_ns() - event.t_ns) * 1e-9)
+    def _set(self, event: Event, text: str) -> None:
+        self.now = Halt(text, time.time() - (time.monotonic_ns() - event.t_ns) * 1e-9)
 
 
-def _stop_words(event: Event, operator: str, repeated: bool) -> str:
+def _stop_text(event: Event, operator: str, repeated: bool) -> str:
     codes = [reason.code for reason in event.reasons if reason.code != "STOPPED"]
     if codes:
         return f"stopped for {', '.join(codes)}"

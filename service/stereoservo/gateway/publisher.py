@@ -143,24 +143,24 @@ def core_event_fields(event: Event) -> dict[str, Any]:
     }
 
 
-class KeeperNotes:
+class OperatorNotes:
     """Notes for the cell's keeper, one per topic, shown in the state; a new one is also reported by one event.
 
     ``standing``: notes of the whole run.
     """
 
-    def __init__(self, log: EventLog, standing: tuple[str, ...] = ()) -> None:
+    def __init__(self, log: EventLog, permanent: tuple[str, ...] = ()) -> None:
         self._log = log
         self._texts: dict[str, str] = {}
-        for text in standing:
-            self.tell(text, text)
+        for text in permanent:
+            self.set_note(text, text)
 
     @property
     def texts(self) -> tuple[str, ...]:
         """The notes, oldest topic first."""
         return tuple(self._texts.values())
 
-    def tell(self, topic: str, text: str) -> None:
+    def set_note(self, topic: str, text: str) -> None:
         """Set the note on ``topic``; an empty text removes it."""
         known = topic in self._texts
         if text:

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from stereoservo.daemon.ipc_messages import RunPlan
-from stereoservo.gateway.persistence import Tell
+from stereoservo.gateway.persistence import SetNote
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.messages.recording_request import (
     ImageRecordingRequest,
@@ -23,7 +23,7 @@ from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.ring import RingLimits, RingThread
 from stereoservo.recording.step_records import RecordingStart, StepMessage
 
-LAST_WORD_S = 5.0
+REPORT_TIMEOUT_S = 5.0
 """Time limit for vision processes to finish their files [s]; then the gateway reports that they did not."""
 
 
@@ -41,7 +41,7 @@ class ImageRecordings:
         self._others = tuple(camera.name for camera in plan.cameras if camera.delivers != "frames")
         self._directory = ""
         self._until: float | None = None
-        self._told: dict[str, RecordedImages] = {}
+        self._reports: dict[str, RecordedImages] = {}
         self._path.unlink(missing_ok=True)  # of an earlier gateway: its recording has ended
 
     @property
@@ -70,7 +70,7 @@ class ImageRecordings:
             text = f"no images are recorded: {self._path}: {error.strerror}"
             self._log.add("warning", message=text, name=str(directory), origin="gateway")
             return
-        self._directory, self._until, self._told = str(directory), None, {}
+        self._directory, self._until, self._reports = str(directory), None, {}
         left = f"; {', '.join(self._others)} deliver observations and are not in it" if self._others else ""
         self._log.add(
             "images",
@@ -83,18 +83,18 @@ class ImageRecordings:
         """Request the cameras to stop recording. Idempotent."""
         if self.running:
             self._path.unlink(missing_ok=True)
-            self._until = time.monotonic() + LAST_WORD_S
+            self._until = time.monotonic() + REPORT_TIMEOUT_S
 
     def add_report(self, images: RecordedImages) -> None:
         """Add a vision process's report on its recording."""
         if self._directory and Path(images.file).parent == Path(self._directory):
-            self._told[images.camera] = images
+            self._reports[images.camera] = images
 
     def poll(self) -> None:
         """Report the recorded images once all cameras have reported, or after a time limit."""
         if self._until is None:
             return
-        missing = [name for name in self._cameras if name not in self._told]
+        missing = [name for name in self._cameras if name not in self._reports]
         if missing and time.monotonic() < self._until:
             return
         silent = {
@@ -104,11 +104,11 @@ class ImageRecordings:
                 0,
                 0,
                 0,
-                f"or more: its vision process has not said how many within {LAST_WORD_S:g} s; see the daemon's log",
+                f"or more: its vision process did not report how many within {REPORT_TIMEOUT_S:g} s; see the log",
             )
             for name in missing
         }
-        found = tuple((self._told | silent)[name] for name in self._cameras)
+        found = tuple((self._reports | silent)[name] for name in self._cameras)
         text = "; ".join(
             f"{images.camera}: {images.frames} frames"
             + (f", {images.left_out} left out" if images.left_out else "")
@@ -132,10 +132,10 @@ class Recordings:
     cause.
     """
 
-    def __init__(self, plan: RunPlan, log: EventLog, tell: Tell) -> None:
+    def __init__(self, plan: RunPlan, log: EventLog, set_note: SetNote) -> None:
         self._plan = plan
         self._log = log
-        self._tell = tell
+        self._set_note = set_note
         self._requested = bool(plan.record)
         section = plan.cell.recording
         limits = RingLimits(
@@ -174,14 +174,14 @@ class Recordings:
     def poll(self) -> None:
         """Publish the ring's reports, with a note while it is not written, and the state of image recordings."""
         if self._ring is not None:
-            while self._ring.said:
-                kind, message = self._ring.said.popleft()
+            while self._ring.reports:
+                kind, message = self._ring.reports.popleft()
                 if kind == "warning":
-                    self._tell("flight ring", message)
+                    self._set_note("flight ring", message)
                 else:
                     self._log.add(kind, message=message, origin="gateway")
             if not self._ring.trouble:
-                self._tell("flight ring", "")
+                self._set_note("flight ring", "")
         self.images.poll()
 
     def close(self) -> None:
@@ -225,20 +225,20 @@ class Recordings:
             self._fail(f"{path}: no recording: {error.strerror}")
             return
         self.refused = False
-        self._tell("recording", "")
+        self._set_note("recording", "")
         self._log.add("recording", message=self.path, origin="gateway")
 
     def _fail(self, text: str) -> None:
         self._failed = True
         self._log.add("recording_failed", message=text, name=self.path, accepted=False, origin="gateway")
-        self._tell("recording", text)
+        self._set_note("recording", text)
 
     def _new_path(self) -> Path:
         """The requested file; another name if it exists (a restarted gateway continues in a new file)."""
         stamp = datetime.now(UTC).strftime("%Y%m%dT%H%M%S.%fZ")
-        wanted = Path(self._plan.record) if self._plan.record not in ("", "auto") else None
-        if wanted is not None:
-            return wanted.with_stem(f"{wanted.stem}-{stamp}") if wanted.exists() else wanted
+        requested = Path(self._plan.record) if self._plan.record not in ("", "auto") else None
+        if requested is not None:
+            return requested.with_stem(f"{requested.stem}-{stamp}") if requested.exists() else requested
         return self._plan.directories.recordings / f"{self._plan.cell.cell.name}-{stamp}.mcap"
 
     def stop(self) -> str:

@@ -25,11 +25,11 @@ from stereoservo.gateway.point_alignment import (
     TransferError,
     align_points,
     fixed_line,
-    listed,
     reproject_set_points,
     require_still,
 )
 from stereoservo.gateway.publisher import EventLog
+from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import DRAWING, drawn_points, family_between
 from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import carried_point_covariance
@@ -102,7 +102,7 @@ class TaughtGoalRegistry:
         """Raw pixels, by camera, of the ``markers`` that are not on the body, as stored when the goal was taught.
         Raises KeyError.
         """
-        return _where(markers, self._store.goals[target.name].others)
+        return _visible_markers(markers, self._store.goals[target.name].others)
 
     def resolve_incidence(
         self, target: IncidenceTarget, follow: tuple[MarkerId, ...] = ()
@@ -122,7 +122,7 @@ class TaughtGoalRegistry:
                     raise TransferError("the cell has no model yet: calibrate first")
                 if epoch not in (None, model.epoch):
                     raise TransferError(
-                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it anew"
+                        f"the goal is stated with model epoch {epoch}, the cell has {model.epoch}: state it again"
                     )
                 fixed, epoch = fixed_line(fixed, model), model.epoch
             incidences.append(msgspec.structs.replace(spec, fixed=fixed))
@@ -130,7 +130,7 @@ class TaughtGoalRegistry:
         if not any(spec.fixed.markers for spec in target.incidences):
             return resolved, {}
         now = {camera: {m: one.pixel for m, one in shown.items()} for camera, shown in observations.items()}
-        return resolved, _where(follow, now)
+        return resolved, _visible_markers(follow, now)
 
     def _seen(self) -> MarkerObservations:
         return self._marker_cache.now(time.monotonic_ns())
@@ -154,7 +154,9 @@ class TaughtGoalRegistry:
         return False
 
 
-def _where(markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]) -> dict[str, dict[int, Pixel]]:
+def _visible_markers(
+    markers: tuple[MarkerId, ...], shown: Mapping[str, Mapping[int, Pixel]]
+) -> dict[str, dict[int, Pixel]]:
     """The ``markers`` that are ``shown``, by camera and marker; cameras that show none are left out."""
     found = {
         camera: {marker: pixels[marker] for marker in markers if marker in pixels} for camera, pixels in shown.items()

@@ -66,7 +66,7 @@ def _check_options(goal: Goal, context: GoalContext) -> list[str]:
     problems = []
     if isinstance(goal.target, IncidenceTarget):
         problems += [
-            f"{field}: {_said(getattr(goal, field))} belongs to a target that fixes a pose; leave it out of an "
+            f"{field}: {_as_json(getattr(goal, field))} belongs to a target that fixes a pose; leave it out of an "
             "incidence, which is a law of its own"
             for field in INCIDENCE_FIELDS
             if getattr(goal, field) is not None
@@ -115,7 +115,7 @@ def _not_with_joints(goal: Goal) -> list[str]:
             problems.append(
                 f"law: {value!r} works on set-points in images; a target of joints takes none of {listed(LAWS)}"
                 if field == "law"
-                else f"{field}: {_said(value)} belongs to an image law; leave it out of a target of joints"
+                else f"{field}: {_as_json(value)} belongs to an image law; leave it out of a target of joints"
             )
     return problems
 
@@ -256,7 +256,7 @@ def _check_auxiliary(command: OrderAuxiliary, known: tuple[AuxiliarySpec, ...]) 
     return problems
 
 
-def _said(value: object) -> str:
+def _as_json(value: object) -> str:
     """A value in the form in which a client wrote it."""
     return msgspec.json.encode(value).decode() if isinstance(value, msgspec.Struct) else repr(value)
 
@@ -487,7 +487,7 @@ def check_incidence(target: IncidenceTarget, context: GoalContext) -> list[str]:
 
 
 def _check_feature(where: str, feature: Feature, kind: str, has_epoch: bool, context: GoalContext) -> list[str]:
-    given = [way for way in ("markers", "points", "pixels", "segments") if getattr(feature, way)]
+    given = [form for form in ("markers", "points", "pixels", "segments") if getattr(feature, form)]
     if where.endswith("moving") and given != ["markers"]:
         return [f"{where}: given by {listed(given)}; what moves is given by markers of the body"]
     if len(given) != 1:

@@ -67,12 +67,12 @@ def algebra(family: Family) -> FloatArray:
     """Basis (k, 4, 4) of the group's Lie algebra, with trace 0, so that determinants are preserved."""
     units = np.eye(16).reshape(16, 4, 4)
     moves = [units[3], units[7], units[11]]
-    turns = [units[4 * i + j] - units[4 * j + i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    rotations = [units[4 * i + j] - units[4 * j + i] for i, j in ((0, 1), (0, 2), (1, 2))]
     size = np.diag([1.0, 1.0, 1.0, -3.0])
     if family == "rigid":
-        return np.array([*moves, *turns])
+        return np.array([*moves, *rotations])
     if family == "similar":
-        return np.array([*moves, *turns, size])
+        return np.array([*moves, *rotations, size])
     last = 3 if family == "affine" else 4
     off = [units[4 * i + j] for i in range(last) for j in range(4) if i != j]
     stretch = [units[5 * i] - units[15] for i in range(3)]
@@ -148,7 +148,7 @@ def align(
     generators = np.linalg.inv(local) @ algebra(family) @ local
     T = descend(T, generators, views)
     whitening = views.whitening(T)
-    whitened, J = views.residuals(T, whitening), views.slopes(T, generators, whitening)
+    whitened, J = views.residuals(T, whitening), views.jacobian(T, generators, whitening)
     _, singular, rows = np.linalg.svd(J, full_matrices=False)
     k = len(generators)
     if len(singular) < k or not singular[k - 1] > 1e-10 * singular[0]:
@@ -180,7 +180,7 @@ class PointViews:
         whitened: FloatArray = (whitening @ flat).ravel()
         return whitened
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
         """Derivatives (r, k) of the residuals by x in ``exp(Σ x Ĝ) T`` at x = 0."""
         moved = self.M @ T.T
         by_point = projection_jacobian_many(self.Ps, moved)
@@ -196,7 +196,7 @@ class ImageConstraints(Protocol):
 
     def residuals(self, T: FloatArray, whitening: Any) -> FloatArray: ...
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: Any) -> FloatArray: ...
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: Any) -> FloatArray: ...
 
 
 def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> FloatArray:
@@ -204,7 +204,7 @@ def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> F
     for _ in range(ITERATIONS):
         whitening = views.whitening(T)
         residuals = views.residuals(T, whitening)
-        step = -np.linalg.lstsq(views.slopes(T, generators, whitening), residuals, rcond=1e-12)[0]
+        step = -np.linalg.lstsq(views.jacobian(T, generators, whitening), residuals, rcond=1e-12)[0]
         cost = residuals @ residuals
         for _ in range(HALVINGS):
             trial: FloatArray = expm(np.tensordot(step, generators, axes=1)) @ T
@@ -244,10 +244,10 @@ def local_frame(family: Family, X: FloatArray) -> FloatArray:
     if family == "projective":
         return whitener(X)
     x = X[:, :3] / X[:, 3:]
-    middle = x.mean(axis=0)
+    centroid = x.mean(axis=0)
     local = np.eye(4)
-    local[:3, 3] = -middle
-    local[:3] /= max(float(np.sqrt(((x - middle) ** 2).sum(axis=1).mean())), 1e-300)
+    local[:3, 3] = -centroid
+    local[:3] /= max(float(np.sqrt(((x - centroid) ** 2).sum(axis=1).mean())), 1e-300)
     return local
 
 

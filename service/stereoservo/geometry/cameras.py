@@ -202,32 +202,32 @@ def canonical_pair(
     scale = np.sqrt(s[0] * s[1])
     epipole, null = U[:, 2], Vt[2]
     cross = np.array([[0, -epipole[2], epipole[1]], [epipole[2], 0, -epipole[0]], [-epipole[1], epipole[0], 0]])
-    turned = cross @ (U[:, :2] * (s[:2] / scale)) @ Vt[:2]
+    rotated = cross @ (U[:, :2] * (s[:2] / scale)) @ Vt[:2]
 
     rays_left, rays_right = _nominal_rays(F, N_left, N_right, K, left, right)
     best: tuple[int, FloatArray, FloatArray] | None = None
     for sign in (1.0, -1.0):  # the twisted pair: half a turn about the baseline
-        block = sign * turned + np.outer(epipole, null)
+        block = sign * rotated + np.outer(epipole, null)
         if np.linalg.det(block) < 0:
-            block = sign * turned - np.outer(epipole, null)
-        heights, depths = _heights_and_depths(block, epipole, rays_left, rays_right)
+            block = sign * rotated - np.outer(epipole, null)
+        scales, depths = _scales_and_depths(block, epipole, rays_left, rays_right)
         front = depths > 0
         # Heights and depths of equal sign mean "in front of both", whichever sign of e' is needed for that.
-        count = max(int((front & (heights > 0)).sum()), int((front & (heights < 0)).sum()))
+        count = max(int((front & (scales > 0)).sum()), int((front & (scales < 0)).sum()))
         if best is None or count > best[0]:
-            best = (count, block, heights)
+            best = (count, block, scales)
     assert best is not None
-    _, block, heights = best
-    heights = heights[np.isfinite(heights)]
-    middle = float(np.median(heights)) if len(heights) else 0.0
+    _, block, scales = best
+    scales = scales[np.isfinite(scales)]
+    median = float(np.median(scales)) if len(scales) else 0.0
     # With a wrong nominal focal length the plane at infinity may pass between the points: move it, by a, behind them.
-    side = float(np.copysign(1.0, middle))
-    lowest = float((side * heights).min()) if len(heights) else 0.0
-    if lowest < 0.25 * abs(middle):
-        shift = side * (lowest - 0.25 * abs(middle)) / 0.75
+    side = float(np.copysign(1.0, median))
+    lowest = float((side * scales).min()) if len(scales) else 0.0
+    if lowest < 0.25 * abs(median):
+        shift = side * (lowest - 0.25 * abs(median)) / 0.75
         block = block + shift * np.outer(epipole, [0.0, 0.0, 1.0])
-        middle -= shift
-    baseline = np.copysign(np.clip(abs(middle), 1e-3, 1e3), middle) * epipole
+        median -= shift
+    baseline = np.copysign(np.clip(abs(median), 1e-3, 1e3), median) * epipole
     P_left = np.hstack([np.linalg.inv(N_left), np.zeros((3, 1))])
     P_right = np.linalg.inv(N_right) @ K @ np.hstack([block @ np.linalg.inv(K), baseline[:, None]])
     return P_left, P_right
@@ -254,7 +254,7 @@ def _nominal_rays(
     return np.array([[0.0, 0.0, 1.0]]), ray[None]
 
 
-def _heights_and_depths(
+def _scales_and_depths(
     block: FloatArray, epipole: FloatArray, rays_left: FloatArray, rays_right: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fourth coordinate (n,) at left depth 1, and right depth (n,), of points on matched rays: d x' = A x + w e'."""
@@ -263,9 +263,9 @@ def _heights_and_depths(
     moment = np.cross(x, e)
     square = (moment**2).sum(axis=1)
     square = np.where(square > 0, square, np.nan)
-    heights = -(np.cross(x, target) * moment).sum(axis=1) / square
+    scales = -(np.cross(x, target) * moment).sum(axis=1) / square
     depths = (np.cross(target, e) * moment).sum(axis=1) / square
-    return heights, depths
+    return scales, depths
 
 
 def resection(M: FloatArray, pixels: FloatArray, refine: bool = True) -> FloatArray:

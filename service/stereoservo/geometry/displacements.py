@@ -123,8 +123,8 @@ def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> Flo
     """
     if len(X) < 3:
         raise GeometryError("too_few", f"{len(X)} points; a rigid motion needs at least 3", points=len(X))
-    middle_X, middle_Y = X.mean(axis=0), Y.mean(axis=0)
-    x, y = X - middle_X, Y - middle_Y
+    centroid_X, centroid_Y = X.mean(axis=0), Y.mean(axis=0)
+    x, y = X - centroid_X, Y - centroid_Y
     for name, centred in (("first", x), ("second", y)):
         singular = np.linalg.svd(centred, compute_uv=False)
         if not singular[1] > STRAIGHT * singular[0]:
@@ -134,5 +134,5 @@ def similarity_from_points(X: FloatArray, Y: FloatArray, *, scaled: bool) -> Flo
     T = np.eye(4)
     scale = float(np.sum(singular * proper) / np.sum(x * x)) if scaled else 1.0
     T[:3, :3] = scale * (U * proper) @ Vt
-    T[:3, 3] = middle_Y - T[:3, :3] @ middle_X
+    T[:3, 3] = centroid_Y - T[:3, :3] @ centroid_X
     return T

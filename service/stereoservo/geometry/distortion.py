@@ -32,12 +32,12 @@ MET = 1e-10
 """Error [r0] of an inverse with tangential terms above which there is no inverse: the pixel lies beyond the fold."""
 
 
-def straight_lens(width: int, height: int) -> FloatArray:
+def pinhole_lens(width: int, height: int) -> FloatArray:
     """The lens (4,) of a pinhole: ``k`` = 0, centre in the middle of the image, integer = pixel centre."""
     return np.array([0.0, 0.5 * (width - 1), 0.5 * (height - 1), 0.5 * width])
 
 
-def bends(lens: FloatArray) -> bool:
+def has_distortion(lens: FloatArray) -> bool:
     """Whether a lens has distortion."""
     return bool(lens[0] != 0.0 or (len(lens) > 4 and lens[4:].any()))
 
@@ -228,19 +228,19 @@ def lens_from_lines(lines: Sequence[FloatArray], sigma: float, width: int, heigh
     through the centre), ``no_convergence``.
     """
     pixels, starts = _checked(lines, sigma)
-    middle = straight_lens(width, height)
+    pinhole = pinhole_lens(width, height)
     weak = np.array([0.0, 1.0, 1.0]) / (CENTRE_SHARE * width)
 
     def errors_at(lens: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Residuals (n + 3,) in sigmas, the prior's last, and their Jacobian (n + 3, 3) by the lens parameters."""
         error, slope = _projected(lens, pixels, starts, sigma)
-        return np.append(error, weak * (lens[:3] - middle[:3])), np.vstack([slope, np.diag(weak)])
+        return np.append(error, weak * (lens[:3] - pinhole[:3])), np.vstack([slope, np.diag(weak)])
 
     def cost_at(lens: FloatArray) -> float:
         error = errors_at(lens)[0]
         return float(error @ error) if np.isfinite(error).all() else np.inf
 
-    lens = min((np.append(k, middle[1:]) for k in GRID), key=cost_at)
+    lens = min((np.append(k, pinhole[1:]) for k in GRID), key=cost_at)
     damping, cost = 1e-4, cost_at(lens)
     for _ in range(LINE_ITERATIONS):
         error, slope = errors_at(lens)
@@ -306,8 +306,8 @@ def _projected(
         normal, scale = np.zeros(2), np.full(end - first, sigma)
         for _ in range(2):  # the weights depend on the direction, weakly
             weights = 1.0 / scale**2
-            middle = weights @ ideal[here] / weights.sum()
-            offset = ideal[here] - middle
+            centroid = weights @ ideal[here] / weights.sum()
+            offset = ideal[here] - centroid
             normal = np.linalg.eigh(offset.T @ (offset * weights[:, None]))[1][:, 0]
             scale = sigma * np.linalg.norm(normal @ to_ideal[here], axis=1)
         error[here] = offset @ normal / scale

@@ -132,7 +132,7 @@ class _Lines:
         flat: FloatArray = (whitening @ away).ravel()
         return flat
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
         """Derivatives (2 c m, k) of the residuals by x in ``exp(Σ x Ĝ) T`` at x = 0."""
         moved, J = self._moved(T)
         by_map = np.nan_to_num(np.einsum("cmkj,gji,mki->mckg", J, generators, moved))
@@ -172,7 +172,7 @@ class _Planes:
         away: FloatArray = (self._moved(T)[0] * self.b).sum(axis=1) * whitening
         return away
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: FloatArray) -> FloatArray:
         """Derivatives (p, k) of the residuals by the map's parameters."""
         moved, _ = self._moved(T)
         steps = np.einsum("gij,pj->pgi", generators, moved)
@@ -195,8 +195,8 @@ class _Mixed:
             raise np.linalg.LinAlgError("the map has diverged")
         return np.concatenate([part.residuals(T, w) for part, w in zip(self.parts, whitening, strict=True)])
 
-    def slopes(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
-        return np.concatenate([part.slopes(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)])
+    def jacobian(self, T: FloatArray, generators: FloatArray, whitening: tuple[FloatArray, ...]) -> FloatArray:
+        return np.concatenate([part.jacobian(T, generators, w) for part, w in zip(self.parts, whitening, strict=True)])
 
 
 def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -229,14 +229,14 @@ def line_end_points(Ps: FloatArray, segments: FloatArray, sigmas: FloatArray) ->
     covariance = np.zeros((m, 8, 8))
     for index in itertools.product(range(len(Ps)), range(2), range(2)):
         c, end, axis = index
-        there = np.isfinite(segments[c]).all(axis=(1, 2))
-        if not there.any():
+        seen_here = np.isfinite(segments[c]).all(axis=(1, 2))
+        if not seen_here.any():
             continue
         more, less = segments.copy(), segments.copy()
         more[c, :, end, axis] += STEP_PX
         less[c, :, end, axis] -= STEP_PX
         slope = ((points(more) - points(less)) / (2.0 * STEP_PX)).reshape(m, 8)
-        slope = np.where(there[:, None], slope * np.where(there, sigmas[c], 0.0)[:, None], 0.0)
+        slope = np.where(seen_here[:, None], slope * np.where(seen_here, sigmas[c], 0.0)[:, None], 0.0)
         covariance += slope[:, :, None] * slope[:, None, :]
     return A, covariance
 
@@ -296,7 +296,7 @@ def align_incidences(
                 "degenerate",
                 "two maps bring the features onto their images alike; add a line or a point that tells them apart",
             )
-    J = mixed.slopes(T, generators, mixed.whitening(T))
+    J = mixed.jacobian(T, generators, mixed.whitening(T))
     _, singular, rows = np.linalg.svd(J, full_matrices=False)
     k = len(generators)
     if len(singular) < k or not singular[k - 1] > 1e-8 * singular[0]:
@@ -306,10 +306,10 @@ def align_incidences(
     freedom = count - k
     rms = float(np.sqrt(squares / freedom)) if freedom > 0 else 0.0
     change = FrameChange(T, chart @ chart.T, tuple(range(then.points.shape[1])), rms, freedom)
-    return change, *_left(mixed, T)
+    return change, *_fit_residuals(mixed, T)
 
 
-def _left(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _fit_residuals(mixed: _Mixed, T: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Residuals of the map ``T`` (4, 4): rms distances of points [px], and largest distances of lines, relative to
     their uncertainty beside the current noise [px]: a line that lay nearly in an epipolar plane then counts little.
     """
@@ -494,9 +494,9 @@ def _shift(
         for direction in np.linalg.svd(b[1:] - b[0])[2][: len(incidence.second) - 1] if len(b) > 1 else ():
             across = across - np.outer(direction, direction)
         for x in a:
-            turned = R @ x
-            rows.append(across @ np.column_stack([turned if scaled else np.zeros(3), np.eye(3)]))
-            rhs.append(across @ (b[0] if scaled else b[0] - turned))
+            rotated = R @ x
+            rows.append(across @ np.column_stack([rotated if scaled else np.zeros(3), np.eye(3)]))
+            rhs.append(across @ (b[0] if scaled else b[0] - rotated))
     A, y = np.concatenate(rows), np.concatenate(rhs)
     if not scaled:
         A = A[:, 1:]

@@ -242,8 +242,8 @@ def _refuse_epipolar(Ps: FloatArray, segments: FloatArray, sigma: float) -> None
         limit = np.maximum(CERTAINTY * np.sqrt(2.0) * sigma / length, 1e-9)
     angles = crossing_angles(Ps, segments)
     # A pair determines the line if both of its images cross the epipolar lines significantly.
-    told = (angles > limit[:, None]) & (angles.transpose(1, 0, 2) > limit[None, :])
-    lost = np.flatnonzero(~told.any(axis=(0, 1)))
+    epipolar = (angles > limit[:, None]) & (angles.transpose(1, 0, 2) > limit[None, :])
+    lost = np.flatnonzero(~epipolar.any(axis=(0, 1)))
     if len(lost):
         largest = np.nanmax(angles[:, :, lost], axis=(0, 1))
         needed = np.nanmin(limit[:, lost], axis=0)

@@ -81,10 +81,10 @@ def upper_triangular(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     if not singular[2] > 1e-14 * singular[0]:
         raise GeometryError("degenerate", f"the matrix {A.tolist()} is singular", singular=singular)
     Q, R = np.linalg.qr(A[::-1].T)  # A with rows reversed, transposed: QR becomes RQ
-    K, turn = R.T[::-1, ::-1], Q.T[::-1]
+    K, rotation = R.T[::-1, ::-1], Q.T[::-1]
     signs = np.sign(np.diag(K))
-    K, turn = K * signs, signs[:, None] * turn
-    return K / K[2, 2], turn
+    K, rotation = K * signs, signs[:, None] * rotation
+    return K / K[2, 2], rotation
 
 
 def decompose_camera(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -100,7 +100,7 @@ def decompose_camera(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]
     return K, R, t
 
 
-def intrinsics_and_slopes(P: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
+def intrinsics_and_jacobian(P: FloatArray, directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """``(fx, fy, skew, cu, cv)`` (5,) [px] of a Euclidean camera ``P`` (3, 4), and their derivatives (5, p) along
     ``directions`` (p, 3, 4): by ``A Aᵀ ~ K Kᵀ`` of its left block.
     """
@@ -139,16 +139,16 @@ def oriented_plane(plane: FloatArray, points: FloatArray) -> FloatArray:
     The points are scaled so that they are in front (depth 1 in the first camera). Raises GeometryError naming those on
     the other side: a plane at infinity that intersects a finite object is wrong.
     """
-    heights = np.asarray(points, dtype=np.float64) @ plane
-    side = 1.0 if (heights > 0).sum() >= (heights < 0).sum() else -1.0
-    across = np.flatnonzero(side * heights <= 0)
+    scales = np.asarray(points, dtype=np.float64) @ plane
+    side = 1.0 if (scales > 0).sum() >= (scales < 0).sum() else -1.0
+    across = np.flatnonzero(side * scales <= 0)
     if len(across):
         raise GeometryError(
             "orientation",
-            f"point(s) {across.tolist()} of {len(heights)} lie beyond the plane at infinity {plane.tolist()}; "
+            f"point(s) {across.tolist()} of {len(scales)} lie beyond the plane at infinity {plane.tolist()}; "
             "it must not pass between visible points",
             points=across.tolist(),
-            heights=heights.tolist(),
+            heights=scales.tolist(),
         )
     oriented: FloatArray = side * np.asarray(plane, dtype=np.float64)
     return oriented

@@ -41,12 +41,12 @@ TAIL = 1e-3
 """Probability with which one test rejects a good motion."""
 ROUNDS = 5
 """Most rounds of selecting the agreeing motions."""
-HEIGHT_DEVIATION = 1.0 / 3.0
+SCALE_DEVIATION = 1.0 / 3.0
 """Largest relative standard deviation of a point's height: at three of them the point reaches the plane at infinity."""
 
 
 @dataclass(frozen=True, eq=False)
-class MotionJudgement:
+class MotionTest:
     """Result of the test of one motion from rest.
 
     ``reason`` why it is left out, empty if it is used: ``unseen`` (too few points before and after),
@@ -56,8 +56,8 @@ class MotionJudgement:
     infinity from the others). ``conditioning`` σ₁/σ₂ and ``least_conditioning``, below which noise does not
     explain it; ``excess`` the chi-square by which the translation fits worse than the homography, with nine degrees of
     freedom; ``distance`` the squared Mahalanobis distance of its plane from that of the others, with three;
-    ``height_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
-    `HEIGHT_DEVIATION` determines too little by itself, but adds to others. NaN where not computed.
+    ``scale_deviation`` the largest relative standard deviation of a point's height above its own plane: a motion above
+    `SCALE_DEVIATION` determines too little by itself, but adds to others. NaN where not computed.
     """
 
     reason: Reason
@@ -65,7 +65,7 @@ class MotionJudgement:
     least_conditioning: float
     excess: float
     distance: float = float("nan")
-    height_deviation: float = float("nan")
+    scale_deviation: float = float("nan")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class TranslationEstimate:
 
     fit: TranslationFit
     used: BoolArray
-    judgements: tuple[MotionJudgement, ...]
+    tests: tuple[MotionTest, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,7 +109,7 @@ class _Scene:
         """Relative deviation of the points' heights; for coplanar points also of positions off their plane, up to
         their own extent to either side, measured in the images.
         """
-        among = height_deviation(self.rest, fit)
+        among = scale_deviation(self.rest, fit)
         if not self.flat:
             return among
         M = self.rest[np.isfinite(self.rest).all(axis=1)]
@@ -123,11 +123,11 @@ class _Scene:
 
 @dataclass(frozen=True, eq=False)
 class _Single:
-    """One motion tested by itself: its plane at infinity in the chart of `_height_one`, None if it has none."""
+    """One motion tested by itself: its plane at infinity in the chart of `_plane_chart`, None if it has none."""
 
     plane: FloatArray | None
     covariance: FloatArray | None
-    judgement: MotionJudgement
+    test: MotionTest
 
 
 def estimate_translations(
@@ -142,7 +142,7 @@ def estimate_translations(
     infinity undetermined; its data hold the reasons.
 
     Coplanar points (to within their noise) are possible if the motions lead out of their plane. The covariance is of
-    first order: where `height_deviation` is above about 1 % it is too small (at 2 % by half, at 6 % sixfold).
+    first order: where `scale_deviation` is above about 1 % it is too small (at 2 % by half, at 6 % sixfold).
     """
     if len(pixels) < 2:
         raise GeometryError("too_few", "no motion is given; the stop at rest and one more are needed", motions=0)
@@ -151,14 +151,14 @@ def estimate_translations(
     if not reject:
         everything = np.ones(n, dtype=bool)
         fit = _joint(scene, everything)
-        _require_heights(scene, fit)
-        return TranslationEstimate(fit, everything, (MotionJudgement("", np.nan, np.nan, np.nan),) * n)
-    singles = [_judge_alone(scene, s) for s in range(1, n + 1)]
+        _require_positive_scales(scene, fit)
+        return TranslationEstimate(fit, everything, (MotionTest("", np.nan, np.nan, np.nan),) * n)
+    singles = [_test_motion(scene, s) for s in range(1, n + 1)]
     used = _largest_agreement(singles)
     for _ in range(ROUNDS):
         _require_majority(used, singles)
         fit = _joint(scene, used)
-        z, C = _height_one(scene.weighting.right, scene.rest, fit.plane, fit.plane_covariance)
+        z, C = _plane_chart(scene.weighting.right, scene.rest, fit.plane, fit.plane_covariance)
         distances = np.array([_distance(m, z, C) for m in singles])
         again = distances <= chi2_distribution.isf(TAIL, 3)
         if np.array_equal(again, used):
@@ -167,8 +167,8 @@ def estimate_translations(
     else:
         _require_majority(used, singles)
         fit = _joint(scene, used)
-    _require_heights(scene, fit)
-    return TranslationEstimate(fit, used, _verdicts(singles, used, distances))
+    _require_positive_scales(scene, fit)
+    return TranslationEstimate(fit, used, _test_results(singles, used, distances))
 
 
 def _scene(Ps: FloatArray, pixels: FloatArray, sigma: FloatArray | float) -> _Scene:
@@ -198,7 +198,7 @@ def flatness(Ps: FloatArray, M: FloatArray, sigmas: FloatArray) -> float:
     return float(((M @ plane * weights) ** 2).sum())
 
 
-def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
+def scale_deviation(points: FloatArray, fit: TranslationFit) -> float:
     """Largest standard deviation of the scales ``hᵀM`` of points (m, 4), relative to the scales, normalised to 1 at the
     points' centroid. NaN points are left out.
     """
@@ -209,19 +209,19 @@ def height_deviation(points: FloatArray, fit: TranslationFit) -> float:
     return float(np.sqrt(np.einsum("ni,ij,nj->n", M, fit.plane_covariance, M).max()))
 
 
-def _require_heights(scene: _Scene, fit: TranslationFit) -> None:
+def _require_positive_scales(scene: _Scene, fit: TranslationFit) -> None:
     """Raise GeometryError if the plane at infinity is too uncertain, or passes between the points."""
     points = scene.rest[np.isfinite(scene.rest).all(axis=1)]
     deviation = scene.deviation(fit)
-    if not deviation <= HEIGHT_DEVIATION:
+    if not deviation <= SCALE_DEVIATION:
         raise GeometryError(
             "degenerate",
             f"the motions leave the plane at infinity undetermined: the points' heights above it are known to "
-            f"{100 * deviation:.3g} % (at most {100 * HEIGHT_DEVIATION:.3g} %); longer motions, other directions than "
+            f"{100 * deviation:.3g} % (at most {100 * SCALE_DEVIATION:.3g} %); longer motions, other directions than "
             "the optical axis, more motions or less noise are needed"
             + (", or points off one plane: these are coplanar" if scene.flat else ""),
             deviation=deviation,
-            limit=HEIGHT_DEVIATION,
+            limit=SCALE_DEVIATION,
             coplanar=scene.flat,
         )
     oriented_plane(fit.plane, points)
@@ -236,14 +236,14 @@ def _joint(scene: _Scene, used: BoolArray) -> TranslationFit:
     )
 
 
-def _judge_alone(scene: _Scene, stop: int) -> _Single:
+def _test_motion(scene: _Scene, stop: int) -> _Single:
     """Test of one motion from rest: does a homography fit, is it a translation, and with which plane at infinity?"""
     nan = float("nan")
     images, rest, weighting, pair = scene.images, scene.rest, scene.weighting, [0, stop]
     try:
         H_start = scene.homography(stop)
     except GeometryError:
-        return _Single(None, None, MotionJudgement("unseen", nan, nan, nan))
+        return _Single(None, None, MotionTest("unseen", nan, nan, nan))
     W = weighting.right
     back = np.asarray(np.linalg.inv(W), dtype=np.float64)
     both = (images.weights[pair] > 0).any(axis=1).all(axis=0) & np.isfinite(rest).all(axis=1)
@@ -256,7 +256,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
         best = minimise(white, with_rest(motion), x, M, free_points=True)
         covariance = covariance_of(best.information, "the homography")
     except GeometryError:
-        return _Single(None, None, MotionJudgement("points", nan, nan, nan))
+        return _Single(None, None, MotionTest("points", nan, nan, nan))
     H, slopes = motion(best.x)
     refined = conjugate(back, H[0])
     conditioning = least = nan
@@ -266,7 +266,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
         conditioning, least = svd.conditioning, float(svd.singular[0] / noise)
     freedom = white.measurements - len(x) - 3 * int(both.sum())
     if best.cost > chi2_distribution.isf(TAIL, max(1, freedom)):
-        return _Single(None, None, MotionJudgement("points", conditioning, least, nan))
+        return _Single(None, None, MotionTest("points", conditioning, least, nan))
     try:
         plane, directions = scene.start(np.array([stop])) if scene.flat else (svd.plane, svd.generator @ svd.plane)
         fit = bundle_translations(
@@ -279,7 +279,7 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
         )
     except GeometryError as error:
         why: Reason = "not_a_translation" if error.code == "no_model" else "no_motion"
-        return _Single(None, None, MotionJudgement(why, conditioning, least, nan))
+        return _Single(None, None, MotionTest(why, conditioning, least, nan))
     excess = fit.cost - best.cost
     reason: Reason = ""
     if excess > chi2_distribution.isf(TAIL, len(x) - 6):
@@ -287,10 +287,10 @@ def _judge_alone(scene: _Scene, stop: int) -> _Single:
     elif conditioning < least:
         reason = "conditioning"
     if reason:
-        return _Single(None, None, MotionJudgement(reason, conditioning, least, excess))
-    z, variance = _height_one(W, rest, fit.plane, fit.plane_covariance)
+        return _Single(None, None, MotionTest(reason, conditioning, least, excess))
+    z, variance = _plane_chart(W, rest, fit.plane, fit.plane_covariance)
     deviation = scene.deviation(fit)
-    return _Single(z, variance, MotionJudgement("", conditioning, least, excess, height_deviation=deviation))
+    return _Single(z, variance, MotionTest("", conditioning, least, excess, scale_deviation=deviation))
 
 
 def _second_singular_noise(left: FloatArray, H: FloatArray, slopes: FloatArray, covariance: FloatArray) -> float:
@@ -308,7 +308,7 @@ def _second_singular_noise(left: FloatArray, H: FloatArray, slopes: FloatArray, 
     return float(np.sqrt(variance / mean * chi2_distribution.isf(TAIL, freedom)))
 
 
-def _height_one(
+def _plane_chart(
     W: FloatArray, points: FloatArray, plane: FloatArray, covariance: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Chart of a plane (4,): three coordinates and their covariance (3, 3), whitened, scaled to 1 at the centroid of
@@ -319,9 +319,9 @@ def _height_one(
     across = np.linalg.svd(centroid[None])[2][1:]
     back = np.linalg.inv(W).T
     h = back @ plane
-    height = float(h @ centroid)
-    J = across @ (np.eye(4) - np.outer(h / height, centroid)) @ back / height
-    return across @ h / height, np.asarray(J @ covariance @ J.T, dtype=np.float64)
+    scale = float(h @ centroid)
+    J = across @ (np.eye(4) - np.outer(h / scale, centroid)) @ back / scale
+    return across @ h / scale, np.asarray(J @ covariance @ J.T, dtype=np.float64)
 
 
 def _distance(single: _Single, plane: FloatArray, covariance: FloatArray) -> float:
@@ -340,7 +340,7 @@ def _largest_agreement(singles: list[_Single]) -> BoolArray:
     """
     limit = float(chi2_distribution.isf(TAIL, 3))
     best: tuple[int, float, BoolArray] | None = None
-    strong = [m for m in singles if m.judgement.height_deviation <= HEIGHT_DEVIATION]
+    strong = [m for m in singles if m.test.scale_deviation <= SCALE_DEVIATION]
     for single in strong or singles:
         if single.plane is None or single.covariance is None:
             continue
@@ -354,7 +354,7 @@ def _largest_agreement(singles: list[_Single]) -> BoolArray:
 def _require_majority(used: BoolArray, singles: list[_Single]) -> None:
     if 2 * int(used.sum()) > len(used):
         return
-    reasons = [m.judgement.reason or ("" if u else "other_plane") for m, u in zip(singles, used, strict=True)]
+    reasons = [m.test.reason or ("" if u else "other_plane") for m, u in zip(singles, used, strict=True)]
     raise GeometryError(
         "no_model",
         f"{int(used.sum())} of {len(used)} motions are translations that agree on one plane at infinity; more than "
@@ -362,15 +362,15 @@ def _require_majority(used: BoolArray, singles: list[_Single]) -> None:
         used=int(used.sum()),
         motions=len(used),
         reasons=reasons,
-        conditioning=[m.judgement.conditioning for m in singles],
-        excess=[m.judgement.excess for m in singles],
+        conditioning=[m.test.conditioning for m in singles],
+        excess=[m.test.excess for m in singles],
     )
 
 
-def _verdicts(singles: list[_Single], used: BoolArray, distances: FloatArray) -> tuple[MotionJudgement, ...]:
+def _test_results(singles: list[_Single], used: BoolArray, distances: FloatArray) -> tuple[MotionTest, ...]:
     verdicts = []
     for single, use, distance in zip(singles, used, distances, strict=True):
-        alone = single.judgement
+        alone = single.test
         reason: Reason = alone.reason or ("" if use else "other_plane")
         known = float(distance) if np.isfinite(distance) else float("nan")
         verdicts.append(replace(alone, reason=reason, distance=known))

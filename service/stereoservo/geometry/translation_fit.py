@@ -159,7 +159,7 @@ def refine_translations(
         noise = W @ points_covariance[known] @ W.T / size[0, :, :, None] ** 2
         covariance = covariance + covariance @ np.einsum("npi,nij,nqj->pq", lever, noise, lever) @ covariance
     freedom = images.measurements - len(x)
-    return _answer(best, chart, covariance, W, common[0], freedom)
+    return _in_caller_frame(best, chart, covariance, W, common[0], freedom)
 
 
 def bundle_translations(
@@ -192,7 +192,7 @@ def bundle_translations(
     estimated[known] = best.points @ np.linalg.inv(W).T
     estimated = estimated / (estimated @ images.cameras[0, 2])[:, None]
     freedom = images.measurements - len(x) - 3 * int(known.sum())
-    return _answer(best, chart, covariance, W, estimated, freedom)
+    return _in_caller_frame(best, chart, covariance, W, estimated, freedom)
 
 
 def _whitened(
@@ -219,7 +219,7 @@ def _only(images: Images, known: BoolArray) -> Images:
     return Images(images.cameras, images.pixels[:, :, known], images.weights[:, :, known])
 
 
-def _answer(
+def _in_caller_frame(
     best: Minimum, chart: SharedPlane, covariance: FloatArray, W: FloatArray, points: FloatArray, freedom: int
 ) -> TranslationFit:
     """The fit transformed to the caller's frame: ``h = Wᵀ h_w`` of unit norm, the points on its positive side."""

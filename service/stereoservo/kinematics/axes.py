@@ -31,7 +31,7 @@ class FramedModel:
     points: FloatArray
 
 
-def framed(model: CellModel) -> FramedModel:
+def framed_model(model: CellModel) -> FramedModel:
     """Transform the parts of ``model`` into the frame of its stratum."""
     frame = stratum_frame(model.stratum, model.plane_at_infinity, model.projective_to_euclidean)
     back = np.asarray(np.linalg.inv(frame), dtype=np.float64)
@@ -77,9 +77,9 @@ def joint_axes(kinds: tuple[str, ...], generators: FloatArray) -> Axes:
     directions, points, scales = np.empty((n, 3)), np.full((n, 3), np.nan), np.full(n, np.nan)
     for j, (kind, G) in enumerate(zip(kinds, generators, strict=True)):
         if kind == "revolute":
-            turn = 0.5 * np.array([G[2, 1] - G[1, 2], G[0, 2] - G[2, 0], G[1, 0] - G[0, 1]])
-            size = float(np.linalg.norm(turn))
-            directions[j] = turn / size
+            rotation_vector = 0.5 * np.array([G[2, 1] - G[1, 2], G[0, 2] - G[2, 0], G[1, 0] - G[0, 1]])
+            size = float(np.linalg.norm(rotation_vector))
+            directions[j] = rotation_vector / size
             points[j] = np.cross(directions[j], G[:3, 3]) / size
         else:
             scales[j] = np.linalg.norm(G[:3, 3])

@@ -30,7 +30,7 @@ class Composition(IntEnum):
     """All joints act at once, ``exp(Σ Δq_j Ĥ_j)``, with constant operators: an arm commanded by Cartesian twists."""
 
 
-class PresentArm(NamedTuple):
+class CurrentArm(NamedTuple):
     """An arm at its current configuration: its ``operators`` (n, 4, 4) there (5.21), and their `Composition`."""
 
     operators: FloatArray

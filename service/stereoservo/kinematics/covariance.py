@@ -75,7 +75,9 @@ def displaced_model(model: CellModel, x: FloatArray) -> CellModel:
     )
 
 
-def propagated(model: CellModel, function: Callable[[CellModel], FloatArray]) -> tuple[FloatArray, FloatArray]:
+def propagate_covariance(
+    model: CellModel, function: Callable[[CellModel], FloatArray]
+) -> tuple[FloatArray, FloatArray]:
     """Values (r,) of ``function`` at the model and their covariance (r, r), to first order.
 
     ``function`` must not depend on the frame, nor, in the metric stratum, on the undetermined scale. Raises
@@ -95,7 +97,7 @@ def standard_deviations(model: CellModel, function: Callable[[CellModel], FloatA
     """Standard deviations (r,) of the values of ``function``; None if the model contains no covariance."""
     if model.covariance is None:
         return None
-    return np.asarray(np.sqrt(np.diag(propagated(model, function)[1])))
+    return np.asarray(np.sqrt(np.diag(propagate_covariance(model, function)[1])))
 
 
 def predicted_pixels(model: CellModel, positions: FloatArray) -> FloatArray:

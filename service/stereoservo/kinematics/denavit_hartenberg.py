@@ -37,7 +37,7 @@ from stereoservo.kinematics.axes import (
     axis_angle,
     common_normal,
     euclidean_centres,
-    framed,
+    framed_model,
     joint_axes,
     unit,
 )
@@ -53,7 +53,7 @@ PARALLEL = np.radians(5.0)
 """Angle between axes [rad] below which a row has β in place of d."""
 MEETING = 0.01
 """Distance between axes, as a fraction of the arm's size, below which they count as intersecting."""
-DH_HEAD = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
+DH_HEADER = ("joint", "a [mm]", "α [°]", "β [°]", "d [mm]", "θ [°]", "metres of a slide's unit")
 ROUNDING = 1e-9
 """Standard deviations below this fraction of the value are rounding: the value is the known length itself."""
 COLUMNS = ("a", "alpha", "beta", "d", "theta")
@@ -105,12 +105,12 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
     Raises ReadOutError: ``stratum`` (not metric), ``unknown_name``, ``length`` (not positive, or the model's is zero).
     """
     _check_known(model, known)
-    parts = framed(model)
+    parts = framed_model(model)
     axes = axes_at_origin(parts)
     links = conventions(parts)
 
     def read(candidate: CellModel) -> FloatArray:
-        return dh_values(framed(candidate), links, known, model).ravel()
+        return dh_values(framed_model(candidate), links, known, model).ravel()
 
     values = read(model).reshape(-1, 6)
     if not np.isfinite(values[:, :5]).all():
@@ -132,7 +132,7 @@ def denavit_hartenberg(model: CellModel, known: KnownLength) -> tuple[DhRow, ...
 
 
 def dh_cells(row: DhRow) -> tuple[str, ...]:
-    """A row as text below `DH_HEAD`: values with their standard deviations, those set by a convention in brackets."""
+    """A row as text below `DH_HEADER`: values with their standard deviations, those set by a convention in brackets."""
     cells = [row.joint]
     for column in COLUMNS:
         factor = 1e3 if column in ("a", "d") else float(np.degrees(1.0))
@@ -161,7 +161,7 @@ def metres_per_length(model: CellModel, known: KnownLength) -> float:
     Raises ReadOutError as `denavit_hartenberg`.
     """
     _check_known(model, known)
-    parts = framed(model)
+    parts = framed_model(model)
     axes = axes_at_origin(parts)
     length = _length(parts, axes, dh_table(axes, conventions(parts)), known, model)
     if not length > 0.0:

@@ -16,8 +16,8 @@ import msgspec
 import numpy as np
 
 from stereoservo.geometry.cameras import project, projection_jacobian
-from stereoservo.geometry.distortion import bends, distort, distortion_jacobian
-from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, euclidean_centres, framed
+from stereoservo.geometry.distortion import distort, distortion_jacobian, has_distortion
+from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, euclidean_centres, framed_model
 from stereoservo.kinematics.covariance import standard_deviations
 from stereoservo.kinematics.denavit_hartenberg import (
     Convention,
@@ -48,7 +48,7 @@ def gauge_free_quantities(model: CellModel) -> list[Quantity]:
     groups = _groups(model)
 
     def read(candidate: CellModel) -> FloatArray:
-        parts = framed(candidate)
+        parts = framed_model(candidate)
         return np.concatenate([group.values(parts) for group in groups])
 
     values = read(model)
@@ -63,17 +63,17 @@ def gauge_free_quantities(model: CellModel) -> list[Quantity]:
 
 def not_identified(model: CellModel) -> list[tuple[str, str]]:
     """Quantities that the model leaves undetermined, with the reason: ``(name, reason)``."""
-    turning = [name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "revolute"]
+    revolute = [name for name, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "revolute"]
     if model.stratum == "metric":
         return [
             ("scale of lengths", "images and joint angles fix ratios only; one known length gives the scale"),
             ("place of the base and of the tool", "only what lies between the first and the last axis shows"),
         ]
     axes = (
-        f"all axes of {', '.join(turning)} are parallel"
-        if len(turning) > 1
-        else f"{turning[0]} is the only revolute joint"
-        if turning
+        f"all axes of {', '.join(revolute)} are parallel"
+        if len(revolute) > 1
+        else f"{revolute[0]} is the only revolute joint"
+        if revolute
         else "there is no revolute joint"
     )
     metric = (
@@ -95,8 +95,8 @@ def not_identified(model: CellModel) -> list[tuple[str, str]]:
 
 
 def _groups(model: CellModel) -> list[Group]:
-    parts = framed(model)
-    groups = [sights(model, parts), *axis_images(model, parts), *lenses(model)]
+    parts = framed_model(model)
+    groups = [marker_images(model, parts), *axis_images(model, parts), *lenses(model)]
     if model.stratum == "affine":
         groups += affine_quantities(model, parts)
     if model.stratum == "metric":
@@ -125,11 +125,11 @@ class Group:
     values: Values
 
 
-def sights(model: CellModel, parts: FramedModel) -> Group:
+def marker_images(model: CellModel, parts: FramedModel) -> Group:
     """Quantities of the markers' images: raw pixels of the central marker at the zero, its motion by each joint
     (5.38).
     """
-    marker = _middle_marker(parts)
+    marker = _central_marker(parts)
     label = f"marker {model.marker_ids[marker]}"
     names: list[tuple[str, str]] = []
     for camera in model.cameras:
@@ -144,21 +144,21 @@ def sights(model: CellModel, parts: FramedModel) -> Group:
         for P, lens in zip(parts.cameras, parts.lenses, strict=True):
             ideal = project(P, point[None])[0]
             slope = distortion_jacobian(lens, ideal[None])[0] @ projection_jacobian(P, point[None])[0]
-            moves = sense_of(model) * slope @ (parts.generators @ point).T
+            moves = motion_sign(model) * slope @ (parts.generators @ point).T
             out += [distort(lens, ideal[None])[0], moves.T.ravel()]
         return np.concatenate(out)
 
     return Group(tuple(names), values)
 
 
-def sense_of(model: CellModel) -> float:
-    """Sign of joint motion: -1 if the joints carry the cameras, because `framed` returns generators with the signs of
-    an arm that carries the markers.
+def motion_sign(model: CellModel) -> float:
+    """Sign of joint motion: -1 if the joints carry the cameras, because `framed_model` returns generators with the
+    signs of an arm that carries the markers.
     """
     return -1.0 if model.tip_first else 1.0
 
 
-def _middle_marker(parts: FramedModel) -> int:
+def _central_marker(parts: FramedModel) -> int:
     """Marker nearest to the centroid of the markers in the first camera's image."""
     pixels = project(parts.cameras[0], parts.points)
     return int(np.argmin(np.linalg.norm(pixels - pixels.mean(axis=0), axis=1)))
@@ -173,14 +173,18 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
         if kind != "revolute":
             continue
         for c, camera in enumerate(model.cameras):
-            middle = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1), 1.0])
+            image_centre = np.array([0.5 * (camera.width - 1), 0.5 * (camera.height - 1), 1.0])
             here = _image_line(parts, j, c)
-            if abs(here @ middle) > FARTHEST_LINE * camera.width * np.linalg.norm(here[:2]):
+            if abs(here @ image_centre) > FARTHEST_LINE * camera.width * np.linalg.norm(here[:2]):
                 continue
             angle = float(np.remainder(np.arctan2(-here[0], here[1]), np.pi))
 
             def values(
-                parts: FramedModel, j: int = j, c: int = c, angle: float = angle, middle: FloatArray = middle
+                parts: FramedModel,
+                j: int = j,
+                c: int = c,
+                angle: float = angle,
+                image_centre: FloatArray = image_centre,
             ) -> FloatArray:
                 line = _image_line(parts, j, c)
                 along = np.array([line[1], -line[0]])
@@ -188,7 +192,7 @@ def axis_images(model: CellModel, parts: FramedModel) -> list[Group]:
                 u, v = sense * along
                 # Relative to the current angle, so that none jumps by half a turn.
                 turn = np.arctan2(np.cos(angle) * v - np.sin(angle) * u, np.cos(angle) * u + np.sin(angle) * v)
-                return np.array([np.degrees(angle + turn), sense * (line @ middle)])
+                return np.array([np.degrees(angle + turn), sense * (line @ image_centre)])
 
             label = f"axis {joint} in {camera.name}"
             groups.append(Group(((f"{label}: angle", "°"), (f"{label}: distance from the middle", "px")), values))
@@ -199,7 +203,7 @@ def lenses(model: CellModel) -> list[Group]:
     """Quantities of lens distortion, if the model has any."""
     groups = []
     for c, camera in enumerate(model.cameras):
-        if not bends(camera.lens):
+        if not has_distortion(camera.lens):
             continue
 
         label, terms = f"{camera.name}: lens", ("k2", "p1", "p2") if len(camera.lens) > 4 else ()
@@ -277,11 +281,11 @@ def _coordinates(model: CellModel, parts: FramedModel, slides: list[int]) -> lis
 
 def _heights(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Group]:
     """Quantities: heights of markers along a revolute axis, in units of a prismatic joint that is not normal to it."""
-    turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
-    if not turns or not slides or len(parts.points) < 2:
+    revolute = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
+    if not revolute or not slides or len(parts.points) < 2:
         return []
-    j, k = turns[-1], slides[0]
-    normal = _turning_plane(parts.generators[j])
+    j, k = revolute[-1], slides[0]
+    normal = _rotation_plane(parts.generators[j])
     step = parts.generators[k, :3, 3]
     if abs(normal @ step) < INDEPENDENT * np.linalg.norm(normal) * np.linalg.norm(step):
         return []
@@ -295,14 +299,14 @@ def _heights(model: CellModel, parts: FramedModel, slides: list[int]) -> list[Gr
     )
 
     def values(parts: FramedModel) -> FloatArray:
-        normal = _turning_plane(parts.generators[j])
+        normal = _rotation_plane(parts.generators[j])
         heights = (parts.points[1:, :3] - parts.points[0, :3]) @ normal
         return np.asarray(heights / (normal @ parts.generators[k, :3, 3]), dtype=np.float64)
 
     return [Group(names, values)]
 
 
-def _turning_plane(G: FloatArray) -> FloatArray:
+def _rotation_plane(G: FloatArray) -> FloatArray:
     """Normal covector (3,) of the planes of an affine rotation: the left kernel of its 3x3 block."""
     result: FloatArray = np.linalg.svd(G[:3, :3].T)[2][2]
     return result
@@ -310,9 +314,9 @@ def _turning_plane(G: FloatArray) -> FloatArray:
 
 def _parallel_axes(model: CellModel, parts: FramedModel) -> list[Group]:
     """Quantities of three successive parallel revolute axes: ratio of distances, and the angle at the middle one."""
-    turns = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
+    revolute = [j for j, kind in enumerate(parts.kinds) if kind == "revolute"]
     groups = []
-    for three in zip(turns, turns[1:], turns[2:], strict=False):
+    for three in zip(revolute, revolute[1:], revolute[2:], strict=False):
         directions = np.array([_axis_direction(parts.generators[j]) for j in three])
         if np.linalg.norm(np.cross(directions[0], directions[1:]), axis=1).max() > PARALLEL:
             continue

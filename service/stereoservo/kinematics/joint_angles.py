@@ -19,11 +19,11 @@ from scipy.stats import qmc
 from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
     JointProblem,
-    SeenChain,
+    ObservedChain,
     joint_problem,
-    points_seen,
+    observed_chain,
     predicted_pixels,
-    seen_chain,
+    reconstruct_points,
 )
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray
@@ -100,7 +100,7 @@ def measured_joints(
         raise _behind()
     q, costs = _wrapped(ends[front], bounds, seen), costs[front]
     ordered = _possible(problem, costs)
-    _refuse_open(problem, q[ordered[0]], largest_deviation)
+    _refuse_undetermined(problem, q[ordered[0]], largest_deviation)
     # Few are left: those in a narrow valley are refined to its minimum, where they are one configuration.
     ends, costs, _ = _descent(problem.linearise, q[ordered], VALLEY_STEPS)
     ordered = np.argsort(costs, kind="stable")
@@ -218,7 +218,7 @@ class Homing:
 
 
 def homing_problem(
-    seen: SeenChain,
+    seen: ObservedChain,
     home: FloatArray,
     home_pixels: FloatArray,
     pixels: FloatArray,
@@ -230,7 +230,7 @@ def homing_problem(
     The points are reconstructed from the home images and weighted by their covariance. Raises JointAnglesError if no
     point is seen by two cameras at home.
     """
-    points, covariance = points_seen(seen, home, home_pixels, sigma)
+    points, covariance = reconstruct_points(seen, home, home_pixels, sigma)
     if not np.isfinite(points).all(axis=1).any():
         raise JointAnglesError("too_few", "no point is seen by two cameras in the home image; one is needed")
     return joint_problem(seen, points, pixels, sigma, point_covariance=covariance)
@@ -268,7 +268,7 @@ class JointZeros:
 
 
 def joint_zeros(
-    seen: SeenChain,
+    seen: ObservedChain,
     points: FloatArray,
     pixels: FloatArray,
     sigma: FloatArray | float,
@@ -308,25 +308,25 @@ def joint_zeros(
 
 
 @dataclass(frozen=True)
-class TellingMotion:
+class DistinguishingMotion:
     """A motion of one joint (by index) by ``step`` [rad or m] that distinguishes postures with the same images: after
-    it, ``told`` pairs of postures differ in their images, by at least ``pixels`` [px].
+    it, ``distinguished`` pairs of postures differ in their images, by at least ``pixels`` [px].
     """
 
     joint: int
     step: float
-    told: int
+    distinguished: int
     pixels: float
 
 
-def telling_motion(
+def distinguishing_motion(
     model: CellModel,
     postures: FloatArray,
     readings: FloatArray,
     limits: FloatArray,
     step: float,
     least_px: float,
-) -> TellingMotion | None:
+) -> DistinguishingMotion | None:
     """Motion of one joint by ±``step`` [rad or m] that distinguishes the most pairs of the ``postures`` (p, n), which
     have the same images: a marker inside an image then differs by ``least_px`` or more. None if there is no such
     motion.
@@ -335,19 +335,21 @@ def telling_motion(
     """
     first, second = np.triu_indices(len(postures), 1)
     sizes = np.array([[camera.width, camera.height] for camera in model.cameras], dtype=np.float64)
-    found: list[TellingMotion] = []
+    found: list[DistinguishingMotion] = []
     for joint, by in product(range(len(readings)), (step, -step)):
         if not limits[joint, 0] <= readings[joint] + by <= limits[joint, 1]:
             continue
         moved = postures + by * np.eye(len(readings))[joint]
-        pixels = predicted_pixels(seen_chain(model), moved, model.marker_points)
+        pixels = predicted_pixels(observed_chain(model), moved, model.marker_points)
         inside: BoolArray = np.asarray(((pixels > -0.5) & (pixels < sizes[:, None] - 0.5)).all(axis=-1))
-        apart = np.linalg.norm(pixels[first] - pixels[second], axis=-1)
-        apart = np.where(inside[first] & inside[second], apart, 0.0).max(axis=(1, 2))
-        told = apart >= least_px
-        if told.any():
-            found.append(TellingMotion(joint, by, int(told.sum()), float(apart[told].min())))
-    return max(found, key=lambda motion: (motion.told, motion.pixels), default=None)
+        pixel_distances = np.linalg.norm(pixels[first] - pixels[second], axis=-1)
+        pixel_distances = np.where(inside[first] & inside[second], pixel_distances, 0.0).max(axis=(1, 2))
+        distinguished = pixel_distances >= least_px
+        if distinguished.any():
+            found.append(
+                DistinguishingMotion(joint, by, int(distinguished.sum()), float(pixel_distances[distinguished].min()))
+            )
+    return max(found, key=lambda motion: (motion.distinguished, motion.pixels), default=None)
 
 
 def sensitivity(problem: JointProblem, changed: JointProblem, opposite: JointProblem, q: FloatArray) -> FloatArray:
@@ -361,7 +363,7 @@ def sensitivity(problem: JointProblem, changed: JointProblem, opposite: JointPro
     return np.asarray(-np.linalg.lstsq(slope[0], 0.5 * (plus - minus), rcond=None)[0], dtype=np.float64)
 
 
-def _bounds(seen: SeenChain, limits: FloatArray | None, *, local: bool) -> FloatArray:
+def _bounds(seen: ObservedChain, limits: FloatArray | None, *, local: bool) -> FloatArray:
     """Limits (n, 2); by default a full turn about the zero."""
     n = seen.chain.joints
     if limits is not None:
@@ -434,23 +436,23 @@ def _descent(linearise: Linearise, q: FloatArray, steps: int) -> tuple[FloatArra
     return q, cost, front
 
 
-def _distinct(q: FloatArray, seen: SeenChain) -> FloatArray:
+def _distinct(q: FloatArray, seen: ObservedChain) -> FloatArray:
     """One of each group of configurations (s, n) that agree within a hundredth."""
-    turn = np.array([2.0 * np.pi if kind == "revolute" else np.inf for kind in seen.chain.kinds])
-    folded = np.where(np.isfinite(turn), np.mod(q, turn), q)
+    full_turn = np.array([2.0 * np.pi if kind == "revolute" else np.inf for kind in seen.chain.kinds])
+    folded = np.where(np.isfinite(full_turn), np.mod(q, full_turn), q)
     _, first = np.unique(np.round(folded / 0.01).astype(np.int64), axis=0, return_index=True)
     return q[np.sort(first)]
 
 
-def _wrapped(q: FloatArray, bounds: FloatArray, seen: SeenChain) -> FloatArray:
+def _wrapped(q: FloatArray, bounds: FloatArray, seen: ObservedChain) -> FloatArray:
     """Revolute angles (s, n) wrapped to within half a turn of the centre of their limits."""
     revolute = np.array([kind == "revolute" for kind in seen.chain.kinds])
-    middle = np.where(revolute, bounds.mean(axis=1), 0.0)
-    turned = middle + np.mod(q - middle + np.pi, 2.0 * np.pi) - np.pi
-    return np.where(revolute, turned, q)
+    centre = np.where(revolute, bounds.mean(axis=1), 0.0)
+    wrapped = centre + np.mod(q - centre + np.pi, 2.0 * np.pi) - np.pi
+    return np.where(revolute, wrapped, q)
 
 
-def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
+def _refuse_undetermined(problem: JointProblem, q: FloatArray, largest: float) -> None:
     """Raise JointAnglesError if the pixels do not determine a joint's position at ``q`` (n,)."""
     slope = problem.linearise(q[None])[1][0]
     _, singular, rows = np.linalg.svd(slope, full_matrices=len(slope) < len(q))
@@ -470,7 +472,7 @@ def _refuse_open(problem: JointProblem, q: FloatArray, largest: float) -> None:
         )
 
 
-def _same(difference: FloatArray, worse: float, information: FloatArray, seen: SeenChain) -> bool:
+def _same(difference: FloatArray, worse: float, information: FloatArray, seen: ObservedChain) -> bool:
     """Whether two end points of a search are the same configuration; they differ by ``difference`` (n,) and in cost by
     ``worse``. They are the same within a tenth of a standard deviation, or in one basin of attraction, where the cost
     grows as the square of the distance.

@@ -35,7 +35,7 @@ class JointAnglesError(ValueError):
 
 
 @dataclass(frozen=True, eq=False)
-class SeenChain:
+class ObservedChain:
     """A chain and the cameras that observe its points, or are mounted on it: ``cameras`` (c, 3, 4) to ideal pixels,
     ``lenses`` (c, 4) or (c, 7) from them to raw ones. The third row of each camera is positive for points in front, as
     in calibrated models.
@@ -81,9 +81,9 @@ class SeenChain:
         return before[n], slopes
 
 
-def seen_chain(model: CellModel) -> SeenChain:
+def observed_chain(model: CellModel) -> ObservedChain:
     """Chain, cameras and lenses of a calibrated cell."""
-    return SeenChain(
+    return ObservedChain(
         ProjectiveChain(model.joint_kinds, model.generators, model.zero, model.tip_first),
         np.array([camera.matrix for camera in model.cameras]),
         np.array([camera.lens for camera in model.cameras]),
@@ -105,7 +105,7 @@ class JointProblem:
     them, 0 where missing; ``offsets`` (k, n).
     """
 
-    seen: SeenChain
+    seen: ObservedChain
     points: FloatArray
     point_roots: FloatArray | None
     pixels: FloatArray
@@ -122,7 +122,7 @@ class JointProblem:
         """Degrees of freedom: measurements minus parameters (uncertain points count as both)."""
         return self.measurements - self.seen.chain.joints
 
-    def moved(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    def project(self, q: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
         """Projected points ``m = P H M`` (s, k, c, m, 3) and their derivatives with respect to the joints
         (s, k, c, m, 3, n) at configurations ``q`` (s, n), ``P H`` (s, k, c, 3, 4), and whether all points lie in front
         of the cameras that see them (s,).
@@ -131,9 +131,9 @@ class JointProblem:
         k = len(self.offsets)
         H, slopes = self.seen.displacements((q[:, None] + self.offsets).reshape(s * k, n))
         through: FloatArray = (self.seen.cameras @ H[:, None]).reshape(s, k, -1, 3, 4)
-        turning = self.seen.cameras[:, None] @ slopes[:, None]
+        by_joint = self.seen.cameras[:, None] @ slopes[:, None]
         images = through @ self.points.T
-        changes = (turning @ self.points.T).reshape(s, k, len(self.seen.cameras), n, 3, -1)
+        changes = (by_joint @ self.points.T).reshape(s, k, len(self.seen.cameras), n, 3, -1)
         depths = np.where(self.roots[..., 0, 0] > 0, images[..., 2, :], 1.0)
         front: BoolArray = np.asarray((depths > 0.0).all(axis=(1, 2, 3)))
         return np.moveaxis(images, -1, -2), np.moveaxis(changes, (-1, -3), (-3, -1)), through, front
@@ -142,7 +142,7 @@ class JointProblem:
         """Whitened residuals (s, r) (predicted minus measured pixels), derivatives (s, r, n), and whether in front
         (s,), at configurations ``q`` (s, n).
         """
-        images, changes, through, front = self.moved(q)
+        images, changes, through, front = self.project(q)
         here = self.roots[..., 0, 0] > 0
         depth = np.where(here & (images[..., 2] != 0.0), images[..., 2], 1.0)
         predicted = images[..., :2] / depth[..., None]
@@ -165,23 +165,23 @@ class JointProblem:
         """Like `linearise`, with unit rays instead of pixels: bounded, and valid behind a camera, for a search from a
         distant start.
         """
-        images, changes, _, front = self.moved(q)
+        images, changes, _, front = self.project(q)
         blocks = np.linalg.inv(self.seen.cameras[:, :, :3])[:, None]
         target = blocks @ np.concatenate([self.pixels, np.ones((*self.pixels.shape[:-1], 1))], axis=-1)[..., None]
         target = target[..., 0] / np.linalg.norm(target[..., 0], axis=-1, keepdims=True)
-        rays, turning = (blocks @ images[..., None])[..., 0], blocks @ changes
+        rays, by_joint = (blocks @ images[..., None])[..., 0], blocks @ changes
         length = np.linalg.norm(rays, axis=-1)
         length = np.where(length > 0.0, length, 1.0)[..., None]
         rays = rays / length
-        turning = (turning - rays[..., None] * (rays[..., None, :] @ turning)) / length[..., None]
+        by_joint = (by_joint - rays[..., None] * (rays[..., None, :] @ by_joint)) / length[..., None]
         here = (self.roots[..., 0, 0] > 0)[..., None]
         s, n = q.shape
-        error, slope = (rays - target) * here, turning * here[..., None]
+        error, slope = (rays - target) * here, by_joint * here[..., None]
         return error.reshape(s, -1), slope.reshape(s, -1, n), front
 
 
 def joint_problem(
-    seen: SeenChain,
+    seen: ObservedChain,
     points: FloatArray,
     pixels: FloatArray,
     sigma: FloatArray | float,
@@ -228,8 +228,8 @@ def joint_problem(
     return JointProblem(seen, np.where(known[:, None], points, 0.0), factors, ideal, roots, steps)
 
 
-def points_seen(
-    seen: SeenChain, q: FloatArray, pixels: FloatArray, sigma: FloatArray | float
+def reconstruct_points(
+    seen: ObservedChain, q: FloatArray, pixels: FloatArray, sigma: FloatArray | float
 ) -> tuple[FloatArray, FloatArray]:
     """Points (m, 4) at the chain's zero, and their covariance (m, 4, 4), from raw ``pixels`` (c, m, 2) [px] at ``q``
     (n,).
@@ -250,7 +250,7 @@ def points_seen(
     return points @ back.T, back @ covariance @ back.T
 
 
-def predicted_pixels(seen: SeenChain, q: FloatArray, points: FloatArray) -> FloatArray:
+def predicted_pixels(seen: ObservedChain, q: FloatArray, points: FloatArray) -> FloatArray:
     """Raw pixels (s, c, m, 2) of ``points`` (m, 4), given at the zero, at configurations ``q`` (s, n) (4.44)."""
     H, _ = seen.displacements(q)
     images = np.einsum("cij,sjl,ml->scmi", seen.cameras, H, points, optimize=True)

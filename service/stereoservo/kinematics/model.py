@@ -204,7 +204,7 @@ class ModelFileError(DamagedError):
         self.key = key
 
 
-MAX_BEND = 1.0
+MAX_DISTORTION = 1.0
 """Largest radial parameter of a lens, at its reference radius: images with more distortion cannot be used."""
 RANK_TOLERANCE = 1e-12
 """Least singular value of a matrix of rank 3 or 4, relative to its size."""
@@ -347,11 +347,11 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
                 f"{camera.name!r}: reference radius {camera.lens[3]:g} px is not positive",
             )
         strongest = max(camera.lens[[0, *range(4, len(camera.lens))]], key=abs)
-        if abs(strongest) > MAX_BEND:
+        if abs(strongest) > MAX_DISTORTION:
             raise ModelFileError(
                 path,
                 f"cameras[{i}].lens",
-                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_BEND:g} either way is taken",
+                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_DISTORTION:g} either way is taken",
             )
         # Rows of unit length: the result is the rank, independent of units.
         rows = np.linalg.norm(camera.matrix, axis=1)
@@ -372,8 +372,10 @@ def _check_metric(model: CellModel, upgrade: FloatArray, path: Path | str) -> No
         raise ModelFileError(path, key, f"has singular values {values.tolist()}; an invertible one is needed")
     twists = upgrade @ model.generators @ np.linalg.inv(upgrade)
     for j, (kind, twist) in enumerate(zip(model.joint_kinds, twists, strict=True)):
-        turn = twist[:3, :3]
-        off = float(np.linalg.norm(turn + turn.T if kind == "revolute" else turn) + np.linalg.norm(twist[3]))
+        rotation = twist[:3, :3]
+        off = float(
+            np.linalg.norm(rotation + rotation.T if kind == "revolute" else rotation) + np.linalg.norm(twist[3])
+        )
         if not off <= METRIC_TOLERANCE * float(np.linalg.norm(twist)):
             raise ModelFileError(
                 path,
@@ -405,13 +407,13 @@ def _check_scene(model: CellModel, path: Path | str) -> None:
         if not np.isfinite(array).all():
             where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
             raise ModelFileError(path, key, f"entry {where} is {array[where]}; finite numbers are needed")
-    heights = points @ model.plane_at_infinity
-    if np.abs(heights - 1.0).max(initial=0.0) > ALGEBRA_TOLERANCE:
-        worst = int(np.abs(heights - 1.0).argmax())
+    scales = points @ model.plane_at_infinity
+    if np.abs(scales - 1.0).max(initial=0.0) > ALGEBRA_TOLERANCE:
+        worst = int(np.abs(scales - 1.0).argmax())
         raise ModelFileError(
             path,
             f"scene_points[{worst}]",
-            f"static marker {ids[worst]}: plane_at_infinity @ M is {heights[worst]:.6g}; 1 is needed",
+            f"static marker {ids[worst]}: plane_at_infinity @ M is {scales[worst]:.6g}; 1 is needed",
         )
     for i, matrix in enumerate(covariances):
         size = float(np.abs(matrix).max())
@@ -478,13 +480,13 @@ def _check_algebra(model: CellModel, path: Path | str) -> None:
                 f"‖{law.replace(' = ', ' - ').replace('- -', '+ ')}‖ is {np.linalg.norm(defect):.2e} with "
                 f"‖Ĥ‖ {size:.2e}; {law} is needed",
             )
-    heights = model.marker_points @ model.plane_at_infinity
-    if np.abs(heights - 1).max() > ALGEBRA_TOLERANCE:
-        worst = int(np.abs(heights - 1).argmax())
+    scales = model.marker_points @ model.plane_at_infinity
+    if np.abs(scales - 1).max() > ALGEBRA_TOLERANCE:
+        worst = int(np.abs(scales - 1).argmax())
         raise ModelFileError(
             path,
             f"marker_points[{worst}]",
-            f"marker {model.marker_ids[worst]}: plane_at_infinity @ M is {heights[worst]:.6g}; 1 is needed",
+            f"marker {model.marker_ids[worst]}: plane_at_infinity @ M is {scales[worst]:.6g}; 1 is needed",
         )
     if (model.stratum == "metric") != (model.projective_to_euclidean is not None):
         raise ModelFileError(

@@ -9,7 +9,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from stereoservo.geometry.strata import decompose_camera
-from stereoservo.kinematics.axes import Axes, framed, unit
+from stereoservo.kinematics.axes import Axes, framed_model, unit
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.denavit_hartenberg import axes_at_origin, base_origin, metres_per_length
 from stereoservo.kinematics.model import CellModel
@@ -50,7 +50,7 @@ def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
     (``stratum``, ``unknown_name``, ``length``), GeometryError.
     """
     metres = metres_per_length(model, known)
-    parts = framed(model)
+    parts = framed_model(model)
     axes = axes_at_origin(parts)
     origin, R = base_origin(axes), _root_axes(axes)
     to_root = np.eye(4)

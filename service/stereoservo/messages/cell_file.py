@@ -460,8 +460,8 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
         return f"; known keys: {', '.join(field.encode_name for field in msgspec.structs.fields(section))}"
     if "Invalid enum value" in text:
         place, _, name = path.rpartition(".")
-        words = _words_of(_SECTIONS.get(place), name)
-        return f"; valid: {', '.join(words)}" if words else ""
+        values = _valid_values(_SECTIONS.get(place), name)
+        return f"; valid: {', '.join(values)}" if values else ""
     value: Any = tree
     for part in key.replace("[", ".[").split("."):
         if not part:
@@ -473,7 +473,7 @@ def _allowed(tree: dict[str, Any], text: str, key: str) -> str:
     return f", got {without_secrets(value)!r}" if not isinstance(value, dict | list) else ""
 
 
-def _words_of(section: type[msgspec.Struct] | None, name: str) -> list[str]:
+def _valid_values(section: type[msgspec.Struct] | None, name: str) -> list[str]:
     """Valid values of a key with a fixed set of values."""
     if section is None:
         return []

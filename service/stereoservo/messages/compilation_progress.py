@@ -29,7 +29,7 @@ class CompilationProgress(msgspec.Struct, frozen=True):
     total: int = 0
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """As text."""
         return f"{self.done} of about {max(self.total, self.done)} kernels" if self.total else f"{self.done} kernels"
 
@@ -55,7 +55,7 @@ def read_progress(runtime: Path, daemon: int = 0) -> tuple[CompilationProgress, 
     return tuple(found)
 
 
-class PatientWait:
+class ProgressTimeout:
     """A time limit [s] that restarts with every change, so that slow compilation does not time out."""
 
     def __init__(self, limit_s: float) -> None:

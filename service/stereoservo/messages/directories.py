@@ -143,7 +143,7 @@ class CellDirectories(NamedTuple):
         """Newest preview picture of ``camera``."""
         return self.runtime / f"preview-{camera}.slot"
 
-    def preview_wanted_slot(self, camera: str) -> Path:
+    def preview_request_slot(self, camera: str) -> Path:
         """Time until which preview pictures of ``camera`` are requested."""
         return self.runtime / f"preview-wanted-{camera}.slot"
 

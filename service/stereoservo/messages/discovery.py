@@ -16,15 +16,15 @@ from typing import Self
 
 import msgspec
 
-from stereoservo.messages.compilation_progress import CompilationProgress, PatientWait, read_progress
+from stereoservo.messages.compilation_progress import CompilationProgress, ProgressTimeout, read_progress
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CELL_NAME, CellDirectories, cell_directories, runtime_root
 from stereoservo.messages.files import read_bounded
 from stereoservo.messages.locks import holder
-from stereoservo.messages.run_record import how_it_ended, read_run
+from stereoservo.messages.run_record import end_cause, read_run
 
 MAX_INFO_BYTES = 1 << 16
-TELL_EVERY_S = 10.0
+REPORT_EVERY_S = 10.0
 """Interval [s] at which the number of compiled kernels is reported to the program that starts a daemon."""
 
 
@@ -93,25 +93,25 @@ def find_daemon(cell: str) -> DaemonInfo:
     directories = cell_directories(name)
     info = daemon_info(directories)
     if info is None:
-        raise NotRunningError(name, tuple(found.cell for found in live_cells()), last_words(directories))
+        raise NotRunningError(name, tuple(found.cell for found in live_cells()), unreachable_reason(directories))
     return info
 
 
-def last_words(directories: CellDirectories) -> str:
+def unreachable_reason(directories: CellDirectories) -> str:
     """Sentence, followed by a space, on a daemon that is not reachable: it does not accept requests yet, or how its
     last run ended; empty if there was none.
     """
     pid = holder(directories.daemon_lock)
     if pid is not None:
-        compiling = ", ".join(one.words for one in read_progress(directories.runtime))
+        compiling = ", ".join(one.text for one in read_progress(directories.runtime))
         more = f"It has compiled {compiling}. " if compiling else ""
         return f"Process {pid} has the cell and takes no requests: it starts, or ends. {more}"
     run = read_run(directories)
     if run is None:
         return ""
     when = "" if run.ended is None else time.strftime(" at %Y-%m-%d %H:%M:%S", time.localtime(run.ended))
-    words = f"Its last run ended{when}: {how_it_ended(run).removesuffix('.')}. "
-    return f"{words}{run.remedy}. " if run.remedy else words
+    text = f"Its last run ended{when}: {end_cause(run).removesuffix('.')}. "
+    return f"{text}{run.remedy}. " if run.remedy else text
 
 
 class DaemonProcess:
@@ -149,14 +149,15 @@ class DaemonProcess:
         tell: Callable[[str], None] = lambda text: None,
     ) -> DaemonInfo:
         """Wait until it accepts requests: ``timeout_s`` counts from the last compiled kernel.
-        ``tell`` receives a line if more kernels were compiled, each `TELL_EVERY_S`. Raises DaemonError with its output.
+        ``tell`` receives a line if more kernels were compiled, each `REPORT_EVERY_S`. Raises DaemonError with its
+        output.
         """
-        wait, due_s = PatientWait(timeout_s), time.monotonic() + TELL_EVERY_S
+        wait, due_s = ProgressTimeout(timeout_s), time.monotonic() + REPORT_EVERY_S
         known: tuple[CompilationProgress, ...] = ()
         while not wait.is_over(progress := self._progress()):
             if progress != known and time.monotonic() > due_s:
-                known, due_s = progress, time.monotonic() + TELL_EVERY_S
-                tell("compiling kernels: " + ", ".join(f"{one.part} {one.words}" for one in progress))
+                known, due_s = progress, time.monotonic() + REPORT_EVERY_S
+                tell("compiling kernels: " + ", ".join(f"{one.part} {one.text}" for one in progress))
             code = self.process.poll()
             if code is not None:
                 raise DaemonError(
@@ -166,10 +167,10 @@ class DaemonProcess:
                 if info.pid == self.process.pid:
                     return info
             time.sleep(0.05)
-        said = f"; it logs into {self._log}" if self._log is not None else ""
+        log_hint = f"; it logs into {self._log}" if self._log is not None else ""
         raise DaemonError(
             f"the daemon was not ready within {timeout_s:g} s, in which it compiled no kernel either: a computer that "
-            f"is too busy? Start it again: what was compiled is kept{said}",
+            f"is too busy? Start it again: what was compiled is kept{log_hint}",
             None,
             self.output(),
         )

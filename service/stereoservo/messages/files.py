@@ -48,8 +48,8 @@ def set_aside(path: Path) -> str:
 
 def with_checksum(document: bytes) -> bytes:
     """A JSON object, indented by one, with the CRC-32 of its text so far as its last member ``crc32``."""
-    head = document.rstrip().removesuffix(b"\n}")
-    return head + b',\n "crc32": "%08x"\n}\n' % zlib.crc32(head)
+    body = document.rstrip().removesuffix(b"\n}")
+    return body + b',\n "crc32": "%08x"\n}\n' % zlib.crc32(body)
 
 
 def verify_checksum(data: bytes) -> None:

@@ -112,10 +112,10 @@ class KeySpace:
         return check_name("schema", self._rest(key, "schema", 1)[0])
 
     def _rest(self, key: str, branch: str, parts: int) -> list[str]:
-        head = f"{self.prefix}/{branch}/"
-        rest = key.removeprefix(head).split("/")
-        if not key.startswith(head) or len(rest) != parts:
-            raise InvalidKeyError(f"key {key!r}: {head}{'/'.join(['<name>'] * parts)} is valid")
+        prefix = f"{self.prefix}/{branch}/"
+        rest = key.removeprefix(prefix).split("/")
+        if not key.startswith(prefix) or len(rest) != parts:
+            raise InvalidKeyError(f"key {key!r}: {prefix}{'/'.join(['<name>'] * parts)} is valid")
         return rest
 
 

@@ -181,5 +181,5 @@ def _may_hold(pid: int, fd: int) -> bool:
         lines = [line.split() for line in Path("/proc/locks").read_text(encoding="ascii").splitlines()]
     except OSError:
         return True
-    pids = {words[4] for words in lines if len(words) > 5 and words[1] == "FLOCK" and words[5].endswith(inode)}
+    pids = {fields[4] for fields in lines if len(fields) > 5 and fields[1] == "FLOCK" and fields[5].endswith(inode)}
     return not pids or str(pid) in pids

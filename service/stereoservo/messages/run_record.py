@@ -58,7 +58,7 @@ def begin_run(directories: CellDirectories, boot: str, pid: int) -> None:
     if before is None or not before.up:  # a failed start has no information about earlier goals
         previous = "" if before is None else before.previous
     else:
-        previous = "" if before.in_order else how_it_ended(before)
+        previous = "" if before.in_order else end_cause(before)
     run = RunRecord(boot, pid, machine_start(), time.time(), previous=previous)
     _replace(directories.run_record, msgspec.json.encode(run))
 
@@ -83,12 +83,12 @@ def read_run(directories: CellDirectories) -> RunRecord | None:
     return _read(directories.run_record, RunRecord)
 
 
-def how_it_ended(run: RunRecord) -> str:
+def end_cause(run: RunRecord) -> str:
     """Cause of the end of a run that has ended, also if no process could write it."""
     if run.cause:
         return run.cause
     if run.machine != machine_start():
-        return "the computer was switched off or started anew while the daemon ran"
+        return "the computer was switched off or restarted while the daemon ran"
     return (
         f"the supervisor (process {run.pid}) was killed (signal 9), by a person or for lack of memory: see "
         "`journalctl -k`"

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from stereoservo.messages.files import read_bounded
-from stereoservo.messages.status import CoreStatus, Halt, Health, RefinementState, StatusHead
+from stereoservo.messages.status import CoreStatus, Halt, Health, RefinementState, StatusHeader
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
 STATE_LAYOUT = "ServoState.1"
@@ -147,9 +147,9 @@ def state_message(
     names = tuple(joint.name for joint in run.joints.joints)
     cameras = {camera.name: _age_s(state.frames_ns.get(camera.name, 0), now_ns) for camera in run.cameras}
     fresh = {camera.name for camera in run.cameras if _fresh(cameras[camera.name], camera.rate_hz)}
-    head: dict[str, Any] = {name: getattr(status, name) for name in StatusHead.__struct_fields__}
+    header: dict[str, Any] = {name: getattr(status, name) for name in StatusHeader.__struct_fields__}
     return StateMessage(
-        **head,
+        **header,
         cell=run.cell.cell.name,
         boot=boot,
         t_wall=time.time() - (time.monotonic_ns() - status.t_ns) * 1e-9,

@@ -72,7 +72,7 @@ class Health(msgspec.Struct, frozen=True):
     reanchoring: str = ""
 
 
-class StatusHead(msgspec.Struct, frozen=True):
+class StatusHeader(msgspec.Struct, frozen=True):
     """Activity of the core and its reasons, as every process and every client reads it, after ``step`` at ``t_ns``
     (monotonic).
     """
@@ -89,7 +89,7 @@ class StatusHead(msgspec.Struct, frozen=True):
     reasons: tuple[Reason, ...]
 
 
-class CoreStatus(StatusHead, Generic[Values], frozen=True, eq=False):
+class CoreStatus(StatusHeader, Generic[Values], frozen=True, eq=False):
     """The state of the core after a step; arrays are of the joints (n,)."""
 
     positions: Values

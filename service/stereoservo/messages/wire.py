@@ -38,7 +38,7 @@ from stereoservo.messages.goals import (
 )
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
-from stereoservo.messages.status import Halt, Health, RefinementState, StatusHead
+from stereoservo.messages.status import Halt, Health, RefinementState, StatusHeader
 
 ENCODING = "application/json"
 MAX_PAYLOAD_BYTES = 65_536
@@ -178,7 +178,7 @@ class LoopInfo(msgspec.Struct, frozen=True):
     records_dropped: int = 0
 
 
-class StateMessage(StatusHead, frozen=True):
+class StateMessage(StatusHeader, frozen=True):
     """The cell's state. ``t_ns`` monotonic on the daemon's host, ``t_wall`` [s since 1970].
 
     Values whose source is lost are left out: of joints ``joints``, ``velocities``, ``efforts``, ``following_errors``
@@ -442,7 +442,7 @@ def read(data: bytes, kind: type[_T]) -> _T:
     try:
         return msgspec.json.decode(data, type=kind)
     except msgspec.ValidationError as error:
-        raise MessageError(_misfit(str(error), data, kind)) from error
+        raise MessageError(_validation_error(str(error), data, kind)) from error
     except Exception as error:  # the decoder's errors have no common class
         raise MessageError(_undecodable(error, data)) from error
 
@@ -458,7 +458,7 @@ def _undecodable(error: Exception, data: bytes) -> str:
     return f"payload is not JSON: {error}"
 
 
-def _misfit(error: str, data: bytes, kind: Any) -> str:
+def _validation_error(error: str, data: bytes, kind: Any) -> str:
     """Validation error with its place, the given value, and the valid values."""
     text, _, where = error.partition(" - at `")
     if where.startswith("key` in `"):
@@ -476,9 +476,9 @@ def _misfit(error: str, data: bytes, kind: Any) -> str:
         known = _keys(_type_at(kind, value, parts), _value_at(value, parts), text.split("`")[1])
         return at + text + (f"; {known}" if known else "")
     given = _value_at(value, parts)
-    said = "" if given is None or isinstance(given, dict | list) or repr(given) in text else f", got {given!r}"
-    words = _words(_type_at(kind, value, parts), parts[-1]) if text.startswith("Invalid ") and parts else ()
-    return at + text + said + (f"; valid: {', '.join(words)}" if words else "")
+    value_text = "" if given is None or isinstance(given, dict | list) or repr(given) in text else f", got {given!r}"
+    values = _valid_values(_type_at(kind, value, parts), parts[-1]) if text.startswith("Invalid ") and parts else ()
+    return at + text + value_text + (f"; valid: {', '.join(values)}" if values else "")
 
 
 _described = functools.cache(inspect.type_info)
@@ -538,12 +538,12 @@ def _keys(found: Any, value: Any, missing: str) -> str:
     """The keys of an object of type ``found``, or the valid values of its tag if that is ``missing``."""
     struct = _struct_of(found, value)
     if struct is None:
-        words = _words(found, missing)
-        return f"valid: {', '.join(words)}" if words else ""
+        values = _valid_values(found, missing)
+        return f"valid: {', '.join(values)}" if values else ""
     return f"known: {', '.join(field.encode_name for field in struct.fields)}"
 
 
-def _words(found: Any, name: str) -> tuple[str, ...]:
+def _valid_values(found: Any, name: str) -> tuple[str, ...]:
     """The valid values of the key ``name`` of type ``found``; empty if its values are not a fixed set."""
     tags = tuple(str(struct.tag) for struct in _structs(found) if struct.tag_field == name)
     return tags or tuple(

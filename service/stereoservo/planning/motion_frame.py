@@ -94,27 +94,27 @@ def conjugate_all(A: FloatArray, G: FloatArray, B: FloatArray) -> FloatArray:
 
 
 @kernel
-def average_over_turns(form: FloatArray, generator: FloatArray) -> None:
+def average_over_rotations(form: FloatArray, generator: FloatArray) -> None:
     """Average a quadratic ``form`` (k, k), in place, over the rotations by a ``generator`` (k, k) of eigenvalues 0,
     ±i.
     """
     size = form.shape[0]
-    square, turned = np.zeros((size, size)), np.empty((size, size))
+    square, rotated = np.zeros((size, size)), np.empty((size, size))
     product, total = np.empty((size, size)), np.zeros((size, size))
     _multiply_into(generator, generator, square)
-    share = 1.0 / AVERAGED
+    weight = 1.0 / AVERAGED
     for sample in range(AVERAGED):
         angle = 2.0 * math.pi * sample / AVERAGED
         sine, versine = math.sin(angle), 1.0 - math.cos(angle)
         for i in range(size):
             for k in range(size):
-                turned[i, k] = sine * generator[i, k] + versine * square[i, k]
-            turned[i, i] += 1.0
-        _multiply_into(form, turned, product)
+                rotated[i, k] = sine * generator[i, k] + versine * square[i, k]
+            rotated[i, i] += 1.0
+        _multiply_into(form, rotated, product)
         for i in range(size):
             for k in range(size):
                 for r in range(size):
-                    total[i, k] += share * turned[r, i] * product[r, k]
+                    total[i, k] += weight * rotated[r, i] * product[r, k]
     for i in range(size):
         for k in range(size):
             form[i, k] = total[i, k]
@@ -135,7 +135,7 @@ def _averaged_form(blocks: FloatArray) -> FloatArray:
     """A positive form (3, 3), averaged over the rotations of each block (k, 3, 3) of eigenvalues 0, ±i in sequence."""
     Q = np.eye(3)
     for j in range(blocks.shape[0]):
-        average_over_turns(Q, blocks[j])
+        average_over_rotations(Q, blocks[j])
     return Q
 
 
@@ -206,11 +206,13 @@ def _root(Q: FloatArray, L: FloatArray) -> bool:
 
 
 @kernel
-def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, eyes: FloatArray) -> FloatArray:
+def motion_frame(
+    operators: FloatArray, plane: FloatArray, centre: FloatArray, camera_centres: FloatArray
+) -> FloatArray:
     """The motion frame ``W`` (4, 4): ``W (x, y, z, 1)`` is a point of height 1, ``W (0, 0, 0, 1)`` the ``centre`` (4,).
 
-    In its coordinates the ``operators`` (n, 4, 4) are Euclidean twists, and the mean distance of ``eyes`` (c, 4) from
-    the centre is 1. All NaN if ``plane`` (4,) is not a plane.
+    In its coordinates the ``operators`` (n, 4, 4) are Euclidean twists, and the mean distance of ``camera_centres``
+    (c, 4) from the centre is 1. All NaN if ``plane`` (4,) is not a plane.
     """
     pivot = 0
     for i in range(1, 4):
@@ -228,7 +230,7 @@ def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, e
         W[i, 3] = centre[i]
     inverse = invert4(W)
     blocks = np.empty((operators.shape[0], 3, 3))
-    turning = 0
+    revolute = 0
     for j in range(operators.shape[0]):
         S = conjugated(inverse, operators[j], W)
         square, size = 0.0, 0.0
@@ -242,12 +244,12 @@ def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, e
         angle = math.sqrt(square)
         for i in range(3):
             for k in range(3):
-                blocks[turning, i, k] = S[i, k] / angle
-        turning += 1
-    blocks = blocks[:turning]
+                blocks[revolute, i, k] = S[i, k] / angle
+        revolute += 1
+    blocks = blocks[:revolute]
     averaged = _averaged_form(blocks)
     L = np.zeros((3, 3))
-    if turning == 0 or not _root(_invariant_form(blocks, averaged), L):
+    if revolute == 0 or not _root(_invariant_form(blocks, averaged), L):
         _root(averaged, L)
     # the columns of the displacements, times the inverse of Lᵀ
     D = np.empty((4, 3))
@@ -261,17 +263,17 @@ def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, e
         for k in range(3):
             W[r, k] = D[r, k]
     inverse = invert4(W)
-    if eyes.shape[0] == 0:
+    if camera_centres.shape[0] == 0:
         return W
     distance = 0.0
-    for c in range(eyes.shape[0]):
+    for c in range(camera_centres.shape[0]):
         square = 0.0
         for i in range(3):
             x = 0.0
             for k in range(4):
-                x += inverse[i, k] * eyes[c, k]
+                x += inverse[i, k] * camera_centres[c, k]
             square += x * x
-        distance += math.sqrt(square) / eyes.shape[0]
+        distance += math.sqrt(square) / camera_centres.shape[0]
     for r in range(4):
         for k in range(3):
             W[r, k] *= distance
@@ -279,7 +281,7 @@ def motion_frame(operators: FloatArray, plane: FloatArray, centre: FloatArray, e
 
 
 @kernel
-def turn(axis: FloatArray, angle: float) -> FloatArray:
+def axis_rotation(axis: FloatArray, angle: float) -> FloatArray:
     """Rotation (3, 3) by ``angle`` [rad] about the unit vector ``axis`` (3,)."""
     sine, half = math.sin(angle), math.sin(0.5 * angle)
     versine = 2.0 * half * half
@@ -295,7 +297,7 @@ def turn(axis: FloatArray, angle: float) -> FloatArray:
 
 
 @kernel
-def turn_between(X: FloatArray, Y: FloatArray) -> FloatArray:
+def rotation_between(X: FloatArray, Y: FloatArray) -> FloatArray:
     """Axis and angle (4,) of the least-squares rotation from centred points ``X`` (m, 3) to ``Y`` (m, 3) (Horn).
 
     Angle in [0, π] [rad]; at 0 the axis is the third of the frame. At π its sign is arbitrary.
@@ -365,8 +367,8 @@ def progress(shape: float, sigma: float) -> float:
 @kernel
 def pose_on_path(path: FloatArray, path_parameter: float) -> FloatArray:
     """Displacement (4, 4) from the current pose, in the motion frame."""
-    R_r = turn(path[0:3], path[3] * progress(path[15], path_parameter))
-    R_p = turn(path[4:7], path[7] * progress(path[16], path_parameter))
+    R_r = axis_rotation(path[0:3], path[3] * progress(path[15], path_parameter))
+    R_p = axis_rotation(path[4:7], path[7] * progress(path[16], path_parameter))
     along, aside = progress(path[14], path_parameter), 4.0 * path_parameter * (1.0 - path_parameter)
     H = np.zeros((4, 4))
     H[3, 3] = 1.0

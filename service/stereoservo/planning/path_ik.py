@@ -136,21 +136,21 @@ def _normal_equations_by_moments(
     ``N_ik = tr(Ĥ_i S Ĥ_kᵀ)``, ``b_i = tr(Ĥ_i Cᵀ)``, of the upper three rows.
     """
     S, C = np.zeros((4, 4)), np.zeros((3, 4))
-    x, way = np.ones(4), np.empty(3)
+    x, rate = np.ones(4), np.empty(3)
     worst = 0.0
     for p in range(points.shape[0]):
         length = 0.0
         for i in range(3):
             x[i] = points[p, i]
-            way[i] = required[p, i] - points[p, i]
-            length += way[i] * way[i]
+            rate[i] = required[p, i] - points[p, i]
+            length += rate[i] * rate[i]
         worst = max(worst, length)
         for i in range(4):
             for k in range(i + 1):
                 S[i, k] += x[i] * x[k]
         for i in range(3):
             for k in range(4):
-                C[i, k] += way[i] * x[k]
+                C[i, k] += rate[i] * x[k]
     for i in range(4):
         for k in range(i):
             S[k, i] = S[i, k]
@@ -328,7 +328,7 @@ def _record_sample(k: int, path_parameter: float, constraints: Constraints, arm:
     return broken
 
 
-class Way(NamedTuple):
+class CandidatePath(NamedTuple):
     """Candidate path of a ``stage`` of `path_search`: a ``path`` of the body in closed form (`motion_frame`) with
     ``residual`` (m, 3), the distance of each point from its goal at the path's end, distributed over the path; or a
     straight line in joint space with ``joint_step`` (n,) per sample.
@@ -347,7 +347,7 @@ class SampleRange(NamedTuple):
     last: int
 
 
-class Following(NamedTuple):
+class FollowSettings(NamedTuple):
     """Settings of an arm that follows a path. ``redundant``: it has self-motion, which keeps its joints away from their
     limits; ``tolerance`` [px] between path and arm: beyond it the path is not reachable; infinite for arms with missing
     degrees of freedom, which leave the path between its ends.
@@ -358,14 +358,16 @@ class Following(NamedTuple):
 
 
 @kernel
-def check_path(way: Way, some: SampleRange, constraints: Constraints, record: PathRecord) -> tuple[int, int]:
+def check_path(
+    candidate: CandidatePath, some: SampleRange, constraints: Constraints, record: PathRecord
+) -> tuple[int, int]:
     """Check ``some`` samples of a path in closed form; returns the kind of the violated limit or −1, and the sample.
     Updates the table of closest approaches in ``record``.
     """
     samples = record.joints.shape[0]
     for k in range(some.first, some.last):
         path_parameter = k / (samples - 1.0)
-        points = _points_on_path(way.path, path_parameter, constraints.body, way.residual)
+        points = _points_on_path(candidate.path, path_parameter, constraints.body, candidate.residual)
         broken = check_view(points, path_parameter, constraints, record.table, True)
         if broken >= 0:
             return broken, k
@@ -374,11 +376,11 @@ def check_path(way: Way, some: SampleRange, constraints: Constraints, record: Pa
 
 @kernel
 def follow_path(
-    way: Way,
+    candidate: CandidatePath,
     some: SampleRange,
     constraints: Constraints,
     arm: Arm,
-    following: Following,
+    settings: FollowSettings,
     record: PathRecord,
 ) -> tuple[int, int]:
     """Move the arm along ``some`` samples of a path; returns the kind of the violated limit or −1, and the sample.
@@ -386,12 +388,12 @@ def follow_path(
     The arm is updated in place; ``record`` is filled.
     """
     s = constraints
-    redundant, tolerance = following
+    redundant, tolerance = settings
     samples = record.joints.shape[0]
     for k in range(some.first, some.last):
         path_parameter = k / (samples - 1.0)
         if k > 0:
-            required = _points_on_path(way.path, path_parameter, s.body, way.residual)
+            required = _points_on_path(candidate.path, path_parameter, s.body, candidate.residual)
             firm = math.isfinite(tolerance) or k == samples - 1
             left = reach(required, s, arm, redundant, ITERATIONS if firm else LENIENT_ITERATIONS)
             distance, marker, limit = 0.0, 0, tolerance
@@ -416,13 +418,13 @@ def follow_path(
 
 @kernel
 def follow_joint_line(
-    way: Way, some: SampleRange, constraints: Constraints, arm: Arm, record: PathRecord
+    candidate: CandidatePath, some: SampleRange, constraints: Constraints, arm: Arm, record: PathRecord
 ) -> tuple[int, int]:
     """As `follow_path`, along a straight line in joint space."""
     samples = record.joints.shape[0]
     for k in range(some.first, some.last):
         if k > 0:
-            move_arm(arm, way.joint_step)
+            move_arm(arm, candidate.joint_step)
         broken = _record_sample(k, k / (samples - 1.0), constraints, arm, record)
         if broken >= 0:
             return broken, k
@@ -432,7 +434,7 @@ def follow_joint_line(
 SEEDS = 32
 ROUNDS = 5
 """Largest number of calls of `reach` from one seed."""
-TURN = 2.0 * math.pi
+FULL_TURN = 2.0 * math.pi
 _PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53)
 
 
@@ -444,8 +446,8 @@ def seed_joints(nth: int, joints: FloatArray, lower: FloatArray, upper: FloatArr
     """
     if nth == 0:
         return joints.copy()
-    low = np.where(np.isfinite(lower), np.maximum(lower, joints - TURN), joints - 0.5 * TURN)
-    high = np.where(np.isfinite(upper), np.minimum(upper, joints + TURN), joints + 0.5 * TURN)
+    low = np.where(np.isfinite(lower), np.maximum(lower, joints - FULL_TURN), joints - 0.5 * FULL_TURN)
+    high = np.where(np.isfinite(upper), np.minimum(upper, joints + FULL_TURN), joints + 0.5 * FULL_TURN)
     shares = np.array([math.sqrt(_PRIMES[j % len(_PRIMES)]) * nth % 1.0 for j in range(len(joints))])
     seed: FloatArray = low + shares * (high - low)
     return seed
@@ -453,12 +455,12 @@ def seed_joints(nth: int, joints: FloatArray, lower: FloatArray, upper: FloatArr
 
 @kernel
 def joints_from_seed(
-    seed: FloatArray, goal: FloatArray, constraints: Constraints, turns: FloatArray, start: Arm
+    seed: FloatArray, goal: FloatArray, constraints: Constraints, revolute: FloatArray, start: Arm
 ) -> tuple[FloatArray, bool]:
     """Joints (n,) that bring the body to the ``goal`` (m, 3), found from ``seed`` (n,); and whether they were found.
 
-    ``start``: the arm at the current pose, not modified. Revolute joints (``turns`` (n,), 1 or 0) are changed by full
-    turns into their limits, near their current positions.
+    ``start``: the arm at the current pose, not modified. Revolute joints (``revolute`` (n,), 1 or 0) are changed by
+    full turns into their limits, near their current positions.
     """
     joints, lower, upper = start.joints, constraints.lower, constraints.upper
     n = joints.shape[0]
@@ -475,10 +477,10 @@ def joints_from_seed(
         if left <= ARRIVED:
             break
     for j in range(n):
-        if turns[j] > 0.0 and math.isfinite(at[j]):
-            at[j] -= TURN * math.floor((at[j] - joints[j]) / TURN + 0.5)
+        if revolute[j] > 0.0 and math.isfinite(at[j]):
+            at[j] -= FULL_TURN * math.floor((at[j] - joints[j]) / FULL_TURN + 0.5)
             if at[j] > upper[j]:
-                at[j] -= TURN
+                at[j] -= FULL_TURN
             elif at[j] < lower[j]:
-                at[j] += TURN
+                at[j] += FULL_TURN
     return at, left <= ARRIVED

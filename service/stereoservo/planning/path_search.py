@@ -32,16 +32,16 @@ from stereoservo.planning.motion_frame import (
     NUMBERS,
     conjugate_all,
     pose_on_path,
-    turn_between,
+    rotation_between,
 )
 from stereoservo.planning.path_ik import (
+    FULL_TURN,
     SEEDS,
-    TURN,
     Arm,
-    Following,
+    CandidatePath,
+    FollowSettings,
     PathRecord,
     SampleRange,
-    Way,
     check_path,
     follow_joint_line,
     follow_path,
@@ -88,7 +88,7 @@ turns of the joints.
 
 POSTURE = 0.35
 """Largest distance of a joint [rad or m] at the goal from the requested posture."""
-THERE = 1e-6
+AT_GOAL = 1e-6
 """Distance of the joints from those at the goal [rad or m] up to which they are at the goal."""
 
 MISSING_FREEDOMS = (TRANSLATION, HINGE, PLANAR)
@@ -101,7 +101,7 @@ ASIDE = (0.0, 0.07, -0.07, 0.15, -0.15, 0.25, -0.25)
 PROFILES: tuple[Profile, ...] = ("linear", "translation-first", "rotation-first", "planar-first")
 PROFILE_COST = 0.06
 TURN_COSTS = (0.0, 0.08, 0.2, 0.3, 0.4)
-"""Costs of the kinds of rotation, in the order of `planner.turnings`, in units of the bends."""
+"""Costs of the kinds of rotation, in the order of `planner.rotation_variants`, in units of the bends."""
 SHAPES: dict[Profile, tuple[float, float, float]] = {
     "linear": (LINEAR, LINEAR, LINEAR),
     "exponential": (EXPONENTIAL, EXPONENTIAL, EXPONENTIAL),
@@ -113,7 +113,9 @@ SHAPES: dict[Profile, tuple[float, float, float]] = {
 
 
 class Candidate(NamedTuple):
-    """One path: ``turning`` of `planner.turnings`, ``profile`` 0 is the requested one, ``bend`` away, right, down."""
+    """One path: ``turning`` of `planner.rotation_variants`, ``profile`` 0 is the requested one, ``bend`` away, right,
+    down.
+    """
 
     turning: int
     profile: int
@@ -151,7 +153,7 @@ CLOSED_FORM, STRAIGHT_IN_JOINTS = int(Stage.CLOSED_FORM), int(Stage.STRAIGHT_IN_
 """The stages as integers, for kernels."""
 
 
-class Planning(msgspec.Struct, eq=False):
+class PlanningState(msgspec.Struct, eq=False):
     """State of planning between two slices. ``finished``: there is a ``plan``, or a ``failure``.
 
     ``failure``: the failures of the goal itself, if any, of the requested path, and of the alternative path that came
@@ -167,7 +169,7 @@ class Planning(msgspec.Struct, eq=False):
     goal: FloatArray
     residual: FloatArray = msgspec.field(name="rest")
     directions: FloatArray
-    turnings: FloatArray
+    rotation_variants: FloatArray
     useful: tuple[bool, ...]
     centre_translation: FloatArray = msgspec.field(name="centre_way")
     start_operators: FloatArray
@@ -181,23 +183,23 @@ class Planning(msgspec.Struct, eq=False):
     all_displacements: FloatArray
     table: FloatArray
     joint_step: FloatArray
-    turns: FloatArray
+    revolute: FloatArray = msgspec.field(name="turns")
     candidate: int = -1
     stage: int = int(Stage.CLOSED_FORM)
     sample: int = 0
     followed: int = 0
     tried: int = 0
-    looked: bool = False
+    end_joints_sought: bool = msgspec.field(name="looked", default=False)
     seeds: int = 0
     goal_failure: ClosestApproach | None = None
-    asked_failure: ClosestApproach | None = None
+    requested_failure: ClosestApproach | None = msgspec.field(name="asked_failure", default=None)
     best_failure: ClosestApproach | None = None
     finished: bool = False
     plan: Plan | None = None
     failure: tuple[ClosestApproach, ...] = ()
 
 
-def plan_on(planning: Planning, samples: float) -> None:
+def continue_planning(planning: PlanningState, samples: float) -> None:
     """Evaluate at most ``samples`` samples of paths, at least one (samples in closed form count a sixteenth)."""
     p = planning
     work = max(1, round(samples * WORK_OF_ARM))
@@ -214,12 +216,12 @@ def plan_on(planning: Planning, samples: float) -> None:
         if broken >= 0:
             _fail(p, broken)
         elif reached == SAMPLES:
-            _end(p)
+            _finish_stage(p)
         if p.sample == 0:
             work -= WORK_OF_PATH
 
 
-def next_candidate(planning: Planning) -> None:
+def next_candidate(planning: PlanningState) -> None:
     """Set up the next candidate path that differs from the previous ones; finish if there is none."""
     p = planning
     p.stage, p.sample = int(Stage.CLOSED_FORM), 0
@@ -232,7 +234,9 @@ def next_candidate(planning: Planning) -> None:
         profile = other_profile(p.request.profile, candidate.profile)
         if profile is None:
             continue
-        path = path_of(candidate, profile, p.turnings[candidate.turning], p.centre_translation, p.directions)
+        path = path_coefficients(
+            candidate, profile, p.rotation_variants[candidate.turning], p.centre_translation, p.directions
+        )
         if candidate.profile > 1 and float(np.abs(path[14:]).max()) == LINEAR:
             continue  # only one component: identical to the linear path
         p.path = path
@@ -241,23 +245,23 @@ def next_candidate(planning: Planning) -> None:
     if p.request.bend and p.request.composition != Composition.SIMULTANEOUS:
         p.stage = int(Stage.MULTISTART_IK)
     else:
-        _give_up(p)
+        _finish_without_plan(p)
 
 
-def _give_up(p: Planning) -> None:
+def _finish_without_plan(p: PlanningState) -> None:
     p.finished = True
-    p.failure = tuple(f for f in (p.goal_failure, p.asked_failure, p.best_failure) if f is not None)
+    p.failure = tuple(f for f in (p.goal_failure, p.requested_failure, p.best_failure) if f is not None)
 
 
-def go_to_posture(planning: Planning) -> None:
+def go_to_posture(planning: PlanningState) -> None:
     """Plan for the requested posture only."""
     planning.stage, planning.sample = int(Stage.MULTISTART_IK), 0
 
 
-def _next_seed(p: Planning) -> None:
+def _next_seed(p: PlanningState) -> None:
     """Find the joints at the goal from the next seed; if within the limits, the straight line to them is tried next."""
     if p.seeds >= SEEDS:
-        _give_up(p)
+        _finish_without_plan(p)
         return
     if p.request.posture is not None:
         _from_posture(p, p.request.posture)
@@ -268,50 +272,50 @@ def _next_seed(p: Planning) -> None:
         _straight_to(p, joints)
 
 
-def _from_posture(p: Planning, posture: FloatArray) -> None:
+def _from_posture(p: PlanningState, posture: FloatArray) -> None:
     """Find the joints at the goal from the ``posture`` (n,) alone, with the same number of full turns; a failure states
     the distance of the markers from the goal in that posture.
     """
     p.seeds = SEEDS
     joints, arrived = _from_joints(p, posture)
-    joints -= TURN * np.round((joints - posture) / TURN) * p.turns
+    joints -= FULL_TURN * np.round((joints - posture) / FULL_TURN) * p.revolute
     if arrived and float(np.abs(joints - posture).max()) <= POSTURE:
         table = empty_table()
         broken = int(check_joints(joints, 1.0, p.constraints, table))
-        if broken < 0 and float(np.abs(joints - p.request.joints).max()) <= THERE:
-            stay(p)
+        if broken < 0 and float(np.abs(joints - p.request.joints).max()) <= AT_GOAL:
+            plan_without_motion(p)
         elif broken < 0:
             _straight_to(p, joints)
         else:
             p.table = table
-            p.goal_failure = approach(p, broken)
+            p.goal_failure = closest_approach(p, broken)
         return
     distance, marker = _distance_in_posture(posture, p.constraints, p.goal, _arm_at_start(p))
-    room = TOLERANCE_PX - distance
-    p.table[NOT_REACHABLE] = (room, room, distance, TOLERANCE_PX, -1.0, marker, 1.0)
-    p.goal_failure = approach(p, NOT_REACHABLE)
+    clearance = TOLERANCE_PX - distance
+    p.table[NOT_REACHABLE] = (clearance, clearance, distance, TOLERANCE_PX, -1.0, marker, 1.0)
+    p.goal_failure = closest_approach(p, NOT_REACHABLE)
 
 
-def stay(planning: Planning) -> None:
+def plan_without_motion(planning: PlanningState) -> None:
     """Finish with a plan of zero duration: the goal is the current pose."""
     p = planning
     start_arm(p, Stage.STRAIGHT_IN_JOINTS)
     broken, _ = _samples(p, 1)
     if broken >= 0:
-        p.failure = (approach(p, broken),)
+        p.failure = (closest_approach(p, broken),)
     else:
         p.plan = Plan(
             times=np.zeros(1),
             joints=p.all_joints[:1].copy(),
             displacements=np.eye(4)[None],
-            shares=np.ones(1),
-            way="none: the goal is where the body is",
+            path_parameters=np.ones(1),
+            description="none: the goal is where the body is",
             approaches=_approaches(p),
         )
     p.finished = True
 
 
-def start_arm(planning: Planning, stage: Stage) -> None:
+def start_arm(planning: PlanningState, stage: Stage) -> None:
     """Reset the arm to its current joints, for ``stage``."""
     p = planning
     p.stage, p.sample = int(stage), 0
@@ -322,7 +326,7 @@ def start_arm(planning: Planning, stage: Stage) -> None:
     p.table = empty_table()
 
 
-def _samples(p: Planning, until: int) -> tuple[int, int]:
+def _samples(p: PlanningState, until: int) -> tuple[int, int]:
     """Evaluate samples of the current stage before ``until``; returns the kind of violated limit or −1, and the last
     sample.
     """
@@ -330,7 +334,7 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
     # an arm with missing degrees of freedom leaves the path between its ends
     tolerance = TOLERANCE_PX if p.rank == RIGID_FREEDOMS and not unconstrained else math.inf
     constraints = _unlimited(p.constraints) if unconstrained else p.constraints
-    broken, reached = _go_on(
+    broken, reached = _evaluate_samples(
         (int(p.stage), p.path, p.residual, p.joint_step),
         (p.sample, until),
         plain(constraints),
@@ -342,18 +346,19 @@ def _samples(p: Planning, until: int) -> tuple[int, int]:
 
 
 @kernel
-def _go_on(
-    way: Fields, some: Fields, constraints: Fields, arm: Fields, following: Fields, record: Fields
+def _evaluate_samples(
+    candidate: Fields, some: Fields, constraints: Fields, arm: Fields, settings: Fields, record: Fields
 ) -> tuple[int, int]:
     """Evaluate samples of a candidate path (`path_ik`), given the fields of all records; returns the kind of the
     violated limit or −1, and the sample.
     """
-    tried, span, bounds, kept = Way(*way), SampleRange(*some), Constraints(*constraints), PathRecord(*record)
-    if tried.stage == CLOSED_FORM:
-        return check_path(tried, span, bounds, kept)
-    if tried.stage == STRAIGHT_IN_JOINTS:
-        return follow_joint_line(tried, span, bounds, Arm(*arm), kept)
-    return follow_path(tried, span, bounds, Arm(*arm), Following(*following), kept)
+    path, span = CandidatePath(*candidate), SampleRange(*some)
+    bounds, samples = Constraints(*constraints), PathRecord(*record)
+    if path.stage == CLOSED_FORM:
+        return check_path(path, span, bounds, samples)
+    if path.stage == STRAIGHT_IN_JOINTS:
+        return follow_joint_line(path, span, bounds, Arm(*arm), samples)
+    return follow_path(path, span, bounds, Arm(*arm), FollowSettings(*settings), samples)
 
 
 def _unlimited(constraints: Constraints) -> Constraints:
@@ -367,16 +372,16 @@ def _unlimited(constraints: Constraints) -> Constraints:
     )
 
 
-def _fail(p: Planning, kind: int) -> None:
+def _fail(p: PlanningState, kind: int) -> None:
     if kind == NOT_REACHABLE:
         p.table[kind, 4] = _missing_freedom(p)
-    failure = approach(p, kind)
-    if p.tried == 1 and p.asked_failure is None:
-        p.asked_failure = failure
-    elif p.best_failure is None or failure.share > p.best_failure.share:
+    failure = closest_approach(p, kind)
+    if p.tried == 1 and p.requested_failure is None:
+        p.requested_failure = failure
+    elif p.best_failure is None or failure.path_parameter > p.best_failure.path_parameter:
         p.best_failure = failure
-    if p.stage == Stage.FOLLOW_PATH and kind in (JOINT_LIMIT, KEEP_OUT, NOT_REACHABLE) and not p.looked:
-        p.looked = True
+    if p.stage == Stage.FOLLOW_PATH and kind in (JOINT_LIMIT, KEEP_OUT, NOT_REACHABLE) and not p.end_joints_sought:
+        p.end_joints_sought = True
         start_arm(p, Stage.UNCONSTRAINED_IK)
     elif p.seeds > 0:
         p.stage, p.sample = int(Stage.MULTISTART_IK), 0
@@ -384,7 +389,7 @@ def _fail(p: Planning, kind: int) -> None:
         next_candidate(p)
 
 
-def _end(p: Planning) -> None:
+def _finish_stage(p: PlanningState) -> None:
     """Continue after the last sample of a stage."""
     if p.stage == Stage.CLOSED_FORM:
         p.followed += 1
@@ -396,11 +401,11 @@ def _end(p: Planning) -> None:
         _continue_from_goal_joints(p, missed)
     elif missed:
         p.followed += GOAL_MISSED
-        room = TOLERANCE_PX - distance
-        p.table[NOT_REACHABLE] = (room, room, distance, TOLERANCE_PX, -1.0, marker, 1.0)
+        clearance = TOLERANCE_PX - distance
+        p.table[NOT_REACHABLE] = (clearance, clearance, distance, TOLERANCE_PX, -1.0, marker, 1.0)
         _fail(p, NOT_REACHABLE)
     else:
-        _finish(p)
+        _accept_path(p)
 
 
 @kernel
@@ -421,7 +426,7 @@ def _distance_in_posture(
     return _distance_from_goal(displacement, constraints, goal)
 
 
-def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
+def _continue_from_goal_joints(p: PlanningState, missed: bool) -> None:
     """Continue with the nearer of the joints at the requested path's end and those of a direct step to the goal."""
     start, s = writable_copy(p.request.joints), p.constraints
     found, table = [], empty_table()
@@ -431,7 +436,7 @@ def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
             found.append(p.joints)
         else:
             p.table = table
-            p.goal_failure = approach(p, broken)
+            p.goal_failure = closest_approach(p, broken)
             p.followed += GOAL_BEYOND
     if p.request.composition != Composition.SIMULTANEOUS and (p.request.bend or p.rank < RIGID_FREEDOMS):
         joints, arrived = _from_seed(p, 0)
@@ -444,28 +449,28 @@ def _continue_from_goal_joints(p: Planning, missed: bool) -> None:
     next_candidate(p)
 
 
-def _from_seed(p: Planning, nth: int) -> tuple[FloatArray, bool]:
+def _from_seed(p: PlanningState, nth: int) -> tuple[FloatArray, bool]:
     s = p.constraints
     return _from_joints(p, seed_joints(nth, p.request.joints, s.lower, s.upper))
 
 
-def _from_joints(p: Planning, seed: FloatArray) -> tuple[FloatArray, bool]:
-    joints, arrived = joints_from_seed(writable_copy(seed), p.goal, p.constraints, p.turns, _arm_at_start(p))
+def _from_joints(p: PlanningState, seed: FloatArray) -> tuple[FloatArray, bool]:
+    joints, arrived = joints_from_seed(writable_copy(seed), p.goal, p.constraints, p.revolute, _arm_at_start(p))
     return joints, bool(arrived)
 
 
-def _arm_at_start(p: Planning) -> Arm:
+def _arm_at_start(p: PlanningState) -> Arm:
     start = writable_copy(p.request.joints)
     return Arm(int(p.request.composition), p.start_operators, start, np.eye(4), np.zeros(len(start)))
 
 
-def _straight_to(p: Planning, joints: FloatArray) -> None:
+def _straight_to(p: PlanningState, joints: FloatArray) -> None:
     p.goal_failure = None  # it belongs to another posture, not to the goal
     p.joint_step = (joints - p.request.joints) / (SAMPLES - 1.0)
     start_arm(p, Stage.STRAIGHT_IN_JOINTS)
 
 
-def _finish(p: Planning) -> None:
+def _accept_path(p: PlanningState) -> None:
     r = p.request
     velocity_max, acceleration_max = (
         r.speed_scale * r.limits.velocity_max,
@@ -479,8 +484,10 @@ def _finish(p: Planning) -> None:
         times=times,
         joints=p.all_joints.copy(),
         displacements=displacements,
-        shares=np.arange(SAMPLES) / (SAMPLES - 1.0),
-        way="straight in the joints" if p.stage == Stage.STRAIGHT_IN_JOINTS else name_of(candidate, profile),
+        path_parameters=np.arange(SAMPLES) / (SAMPLES - 1.0),
+        description="straight in the joints"
+        if p.stage == Stage.STRAIGHT_IN_JOINTS
+        else path_description(candidate, profile),
         approaches=_approaches(p),
     )
     p.finished = True
@@ -499,14 +506,14 @@ def _straight(candidate: Candidate) -> bool:
     return candidate.profile == 0 and candidate.bend == (0.0, 0.0, 0.0) and candidate.turning in (0, 2)
 
 
-def _missing_freedom(p: Planning) -> float:
+def _missing_freedom(p: PlanningState) -> float:
     """Index in `MISSING_FREEDOMS` of the largest component of the body's distance from its pose on the path."""
     body = p.constraints.body
     required = p.goal
     if p.stage != Stage.STRAIGHT_IN_JOINTS:
         required = moved(pose_on_path(p.path, float(p.table[NOT_REACHABLE, 6])), body)
     here = moved(p.displacement, body)
-    rotation = turn_between(here, required)
+    rotation = rotation_between(here, required)
     offsets = body - body.sum(axis=0) / len(body)
     size = math.sqrt(float((offsets * offsets).sum(axis=1).max()))
     shift = (required - here).sum(axis=0) / len(body)
@@ -518,18 +525,18 @@ def _missing_freedom(p: Planning) -> float:
     return 2.0 if abs(float((normal * rotation[:3]).sum())) > math.sqrt(0.5) else 1.0
 
 
-def _approaches(p: Planning) -> tuple[ClosestApproach, ...]:
-    return tuple(approach(p, kind) for kind in range(NOT_REACHABLE) if p.table[kind, 0] < math.inf)
+def _approaches(p: PlanningState) -> tuple[ClosestApproach, ...]:
+    return tuple(closest_approach(p, kind) for kind in range(NOT_REACHABLE) if p.table[kind, 0] < math.inf)
 
 
-def approach(planning: Planning, kind: int) -> ClosestApproach:
+def closest_approach(planning: PlanningState, kind: int) -> ClosestApproach:
     """Closest approach to one kind of limit, from its row of the table."""
     row = planning.table[kind]
     index = int(row[4])
     unit = ("", "", "px", "deg", "of its depth now", "px")[kind]
     if kind in (JOINT_LIMIT, KEEP_OUT):
         joint = index if kind == JOINT_LIMIT else 0
-        unit = "rad" if planning.turns[joint] > 0.0 else "m"
+        unit = "rad" if planning.revolute[joint] > 0.0 else "m"
     return ClosestApproach(
         KINDS[kind], index, float(row[2]), float(row[3]), unit, float(row[1]), float(row[6]), int(row[5])
     )
@@ -558,7 +565,7 @@ def shapes(profile: Profile, amounts: tuple[float, float, float]) -> tuple[float
     return SHAPES["linear"]
 
 
-def path_of(
+def path_coefficients(
     candidate: Candidate,
     profile: Profile,
     turning: FloatArray,
@@ -584,7 +591,7 @@ def other_profile(asked: Profile, nth: int) -> Profile | None:
     return None if profile == asked else profile
 
 
-def name_of(candidate: Candidate, profile: Profile) -> str:
+def path_description(candidate: Candidate, profile: Profile) -> str:
     """Description of a path for the operator."""
     kinds = ("", "one rotation", "the other way round", "planar rotation the other way round")
     kind = (*kinds, "one rotation the other way round")[candidate.turning]
@@ -610,7 +617,7 @@ FASTEST = 1e8
 HALVINGS = 50
 ROUNDS = 12
 """Largest number of times that the pace is reduced where rates between samples exceed those at the samples."""
-LOOKS = 4
+CHECKS_PER_INTERVAL = 4
 """Number of points in an interval at which its rates are checked."""
 VELOCITY_EXCESS, ACCELERATION_EXCESS = 1.01, 1.25
 """Largest velocity and mean acceleration in an interval of the cubics between samples, relative to the limits."""
@@ -667,12 +674,12 @@ def _times_below(
             continue
         low, high = 0.0, ceilings[k]
         for _ in range(HALVINGS):
-            middle = 0.5 * (low + high)
-            least, largest = _next_paces(slopes[k], bows[k], acceleration_max, middle, ceilings[k + 1])
+            midpoint = 0.5 * (low + high)
+            least, largest = _next_paces(slopes[k], bows[k], acceleration_max, midpoint, ceilings[k + 1])
             if least <= largest:
-                low = middle
+                low = midpoint
             else:
-                high = middle
+                high = midpoint
         ceilings[k] = low
     pace = 0.0
     for k in range(K - 1):
@@ -704,16 +711,16 @@ def _excess(
     q, rates, first = np.empty(n), np.empty(n), np.empty(n)
     duration = times[k + 1] - times[k]
     found = 1.0
-    for look in range(LOOKS + 1):
+    for check in range(CHECKS_PER_INTERVAL + 1):
         # the last point is the end, where the next interval begins with the same rates
-        interpolate_into(times, joints, times[k] + duration * look / LOOKS, q, rates)
+        interpolate_into(times, joints, times[k] + duration * check / CHECKS_PER_INTERVAL, q, rates)
         for j in range(n):
             speed = abs(rates[j])
             if speed > VELOCITY_EXCESS * velocity_max[j] and velocity_max[j] > 0.0:
                 found = max(found, (speed / velocity_max[j]) ** 2)
-            if look == 0:
+            if check == 0:
                 first[j] = rates[j]
-            elif look == LOOKS:
+            elif check == CHECKS_PER_INTERVAL:
                 change = abs(rates[j] - first[j]) / duration
                 if change > ACCELERATION_EXCESS * acceleration_max[j] and acceleration_max[j] > 0.0:
                     found = max(found, change / acceleration_max[j])

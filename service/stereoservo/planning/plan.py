@@ -39,10 +39,10 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
 
     ``operators`` (n, 4, 4), ``joints`` (n,), ``points`` (m, 4): current markers; ``targets`` (m, 4): markers at the
     goal; ``centre``, ``centre_target`` (4,): heights 1. ``faces`` (f, 3): markers of the faces that must stay visible
-    to every camera that sees them now and at the goal. ``kept`` (m,): 1 for markers that must stay in the images of
-    these cameras. ``bend``: whether detours from ``profile``'s straight path are searched if that path is not feasible.
-    ``speed_scale`` (0, 1] of velocity and acceleration limits. ``posture`` (n,): joints near which the plan ends, on
-    the straight line in joint space, if the arm can reach the goal in several postures.
+    to every camera that sees them now and at the goal. ``must_stay_visible`` (m,): 1 for markers that must stay in
+    the images of these cameras. ``bend``: whether detours from ``profile``'s straight path are searched if that path is
+    not feasible. ``speed_scale`` (0, 1] of velocity and acceleration limits. ``posture`` (n,): joints near which the
+    plan ends, on the straight line in joint space, if the arm can reach the goal in several postures.
     """
 
     operators: FloatArray
@@ -52,7 +52,7 @@ class PlanRequest(msgspec.Struct, frozen=True, eq=False):
     camera_centres: FloatArray
     points: FloatArray
     targets: FloatArray
-    kept: FloatArray
+    must_stay_visible: FloatArray = msgspec.field(name="kept")
     centre: FloatArray
     centre_target: FloatArray
     faces: IntArray
@@ -67,16 +67,16 @@ class ClosestApproach(msgspec.Struct, frozen=True):
     """Closest approach of a path to one limit, or its violation.
 
     ``index``: of the joint, keep-out or camera; ``marker``: index of the marker, -1 for none. ``value`` and ``limit``
-    in ``unit``; ``room``: clearance, negative if the limit is violated. ``share``: path parameter in [0, 1].
+    in ``unit``; ``clearance``: negative if the limit is violated. ``path_parameter`` in [0, 1].
     """
 
-    what: Limit
+    kind: Limit = msgspec.field(name="what")
     index: int
     value: float
     limit: float
     unit: str
-    room: float
-    share: float
+    clearance: float = msgspec.field(name="room")
+    path_parameter: float = msgspec.field(name="share")
     marker: int = -1
 
 
@@ -84,13 +84,13 @@ class Plan(msgspec.Struct, frozen=True, eq=False):
     """A feasible path in time: K samples from the current pose to the goal.
 
     ``times`` (K,) [s] from 0, ``joints`` (K, n), ``displacements`` (K, 4, 4) of the body from its current pose,
-    ``shares`` (K,): path parameters. ``way``: description for the operator, e.g. "linear" or "bent away from the camera
+    ``path_parameters`` (K,). ``description``: text for the operator, e.g. "linear" or "bent away from the camera
     by 0.1". ``approaches``: the closest approach to each kind of limit.
     """
 
     times: FloatArray
     joints: FloatArray
     displacements: FloatArray
-    shares: FloatArray
-    way: str
+    path_parameters: FloatArray = msgspec.field(name="shares")
+    description: str = msgspec.field(name="way")
     approaches: tuple[ClosestApproach, ...]

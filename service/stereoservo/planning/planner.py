@@ -2,8 +2,8 @@
 enough for a control loop; checks the request and prepares the search.
 
 `start_planning` checks a request, converts it into a motion frame and decides simple cases at once: a goal out of view,
-or hidden, or equal to the current pose. `plan_on` then tries one candidate path after the other (`path_search`). The
-state between two slices is plain data; the result does not depend on the slicing, bit for bit.
+or hidden, or equal to the current pose. `continue_planning` then tries one candidate path after the other
+(`path_search`). The state between two slices is plain data; the result does not depend on the slicing, bit for bit.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.motion_frame import (
     NUMBERS,
+    axis_rotation,
     conjugate_all,
     motion_frame,
     plane_at_infinity,
     pose_on_path,
-    turn,
-    turn_between,
+    rotation_between,
 )
 from stereoservo.planning.path_ik import freedoms
 from stereoservo.planning.path_search import (
     MISSING_FREEDOMS,
     SAMPLES,
     TOLERANCE_PX,
-    Planning,
+    PlanningState,
+    continue_planning,
     face_normal,
     go_to_posture,
     next_candidate,
-    plan_on,
-    stay,
+    plan_without_motion,
 )
 from stereoservo.planning.plan import PlanLimits, PlanRequest
 from stereoservo.planning.visibility_constraints import (
@@ -51,15 +51,15 @@ __all__ = [
     "SAMPLES",
     "TOLERANCE_PX",
     "PlanRequestError",
-    "Planning",
+    "PlanningState",
+    "continue_planning",
     "plan",
-    "plan_on",
     "start_planning",
 ]
 
-PRESENT = 1e-6
+NO_MOTION = 1e-6
 """Distance of all points from their goals, relative to the cameras' distance, up to which no motion is needed."""
-TURNS = 1e-6
+REVOLUTE_NORM = 1e-6
 """Norm of a joint's rotation block, in the motion frame, from which on it counts as revolute."""
 COLLINEAR = 1e-6
 """Squared sine of the angles at the centroid below which all markers are collinear."""
@@ -73,17 +73,17 @@ class PlanRequestError(ValueError):
     """An invalid plan request: numbers that are not finite, invalid limits, collinear markers or a collinear face."""
 
 
-def plan(request: PlanRequest) -> Planning:
+def plan(request: PlanRequest) -> PlanningState:
     """Plan a request completely, in one call. Raises PlanRequestError."""
     planning = start_planning(request)
     while not planning.finished:
-        plan_on(planning, 10 * SAMPLES)
+        continue_planning(planning, 10 * SAMPLES)
     return planning
 
 
-def start_planning(request: PlanRequest) -> Planning:
-    """Planning state from which `plan_on` continues, or a finished one if the request is decided at once. Raises
-    PlanRequestError.
+def start_planning(request: PlanRequest) -> PlanningState:
+    """Planning state from which `continue_planning` continues, or a finished one if the request is decided at once.
+    Raises PlanRequestError.
     """
     r = request
     _check(r)
@@ -101,14 +101,16 @@ def start_planning(request: PlanRequest) -> Planning:
     if not _spans_a_plane(body):
         raise PlanRequestError(f"{len(body)} markers on one line fix no pose: three that span a plane are needed")
     faces = np.array(r.faces, dtype=np.int64, order="C", copy=True).reshape(-1, 3)
-    lying = int(_face_on_a_line(body, faces))
-    if lying >= 0:
-        raise PlanRequestError(f"the markers {faces[lying].tolist()} of a face are on one line")
+    collinear_face = int(_face_on_a_line(body, faces))
+    if collinear_face >= 0:
+        raise PlanRequestError(f"the markers {faces[collinear_face].tolist()} of a face are on one line")
     centre_translation = local[-1].copy()
-    rotation, residual, own, rank = _whole_displacement(body, goal, centre_translation, frame, inverse, operators)
-    constraints, refusal = read_constraints(r, frame, camera_centres, body, goal)
-    kinds = np.stack(turnings(rotation, face_normal(body, constraints.faces)))
-    planning = Planning(
+    rotation, residual, own_operators, rank = _whole_displacement(
+        body, goal, centre_translation, frame, inverse, operators
+    )
+    constraints, violation = read_constraints(r, frame, camera_centres, body, goal)
+    kinds = np.stack(rotation_variants(rotation, face_normal(body, constraints.faces)))
+    planning = PlanningState(
         request=request,
         frame=frame,
         inverse=inverse,
@@ -116,13 +118,13 @@ def start_planning(request: PlanRequest) -> Planning:
         goal=goal,
         residual=residual,
         directions=bend_directions(constraints.cameras[0], constraints.camera_centres),
-        turnings=kinds,
+        rotation_variants=kinds,
         useful=_useful(kinds),
         centre_translation=centre_translation,
-        start_operators=own,
+        start_operators=own_operators,
         rank=int(rank),
         path=np.zeros(NUMBERS),
-        operators=own.copy(),
+        operators=own_operators.copy(),
         joints=np.array(r.joints, dtype=np.float64),
         displacement=np.eye(4),
         bias=np.zeros(n),
@@ -130,14 +132,14 @@ def start_planning(request: PlanRequest) -> Planning:
         all_displacements=np.zeros((SAMPLES, 4, 4)),
         table=empty_table(),
         joint_step=np.zeros(n),
-        turns=(np.abs(own[:, :3, :3]).max(axis=(1, 2)) > TURNS).astype(np.float64),
+        revolute=(np.abs(own_operators[:, :3, :3]).max(axis=(1, 2)) > REVOLUTE_NORM).astype(np.float64),
     )
-    if refusal is not None:
-        planning.finished, planning.failure = True, (refusal,)
+    if violation is not None:
+        planning.finished, planning.failure = True, (violation,)
     elif r.posture is not None:
         go_to_posture(planning)
-    elif float(np.abs(goal - body).max()) <= PRESENT:
-        stay(planning)
+    elif float(np.abs(goal - body).max()) <= NO_MOTION:
+        plan_without_motion(planning)
     else:
         next_candidate(planning)
     return planning
@@ -145,8 +147,16 @@ def start_planning(request: PlanRequest) -> Planning:
 
 def _check(request: PlanRequest) -> None:
     for name in (
-        "operators", "joints", "matrices", "camera_centres", "points", "targets", "kept", "centre", "centre_target"
-    ):  # fmt: skip
+        "operators",
+        "joints",
+        "matrices",
+        "camera_centres",
+        "points",
+        "targets",
+        "must_stay_visible",
+        "centre",
+        "centre_target",
+    ):
         values = getattr(request, name)
         if not np.isfinite(values).all():
             raise PlanRequestError(f"{name} of a plan's request must be finite, got {values.tolist()}")
@@ -204,7 +214,7 @@ def _whole_displacement(
     after it and the ``translation`` (3,) of the centre; and the arm's ``operators`` (n, 4, 4) in the motion frame, and
     its number of degrees of freedom.
     """
-    rotation = turn_between(body, goal)
+    rotation = rotation_between(body, goal)
     whole = np.zeros(NUMBERS)
     for i in range(4):
         whole[i] = rotation[i]
@@ -228,14 +238,14 @@ def _spans_a_plane(body: FloatArray) -> bool:
     m = body.shape[0]
     if m < 3:
         return False
-    middle = np.zeros(3)
+    centroid = np.zeros(3)
     for p in range(m):
         for i in range(3):
-            middle[i] += body[p, i] / m
+            centroid[i] += body[p, i] / m
     edges, longest, far = np.empty((m, 3)), -1.0, 0
     for p in range(m):
         for i in range(3):
-            edges[p, i] = body[p, i] - middle[i]
+            edges[p, i] = body[p, i] - centroid[i]
         if _dot(edges[p], edges[p]) > longest:
             longest, far = _dot(edges[p], edges[p]), p
     across = 0.0
@@ -274,7 +284,7 @@ def bend_directions(camera: FloatArray, camera_centres: FloatArray) -> FloatArra
     return rows
 
 
-def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
+def rotation_variants(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArray, ...]:
     """Hinge axis and angle, planar axis and angle (8,) of each kind of rotation, for a rotation ``(axis, angle)`` (4,).
 
     The kinds: hinge and planar rotation of the face of ``normal`` (3,), both by the smaller angle; a single rotation
@@ -283,21 +293,21 @@ def turnings(rotation: FloatArray, normal: FloatArray | None) -> tuple[FloatArra
     """
     axis, angle = rotation[:3], float(rotation[3])
     whole = 2.0 * math.pi
-    single = _turning(axis, angle, axis, 0.0)
-    single_back = _turning(axis, angle - whole, axis, 0.0)
+    single = _rotation_variant(axis, angle, axis, 0.0)
+    single_back = _rotation_variant(axis, angle - whole, axis, 0.0)
     if normal is None:
         return single, single, single_back, single, single_back
     hinge, theta_r, theta_p = _hinge_and_planar(rotation, normal)
     return (
-        _turning(hinge, theta_r, normal, theta_p),
+        _rotation_variant(hinge, theta_r, normal, theta_p),
         single,
-        _turning(hinge, theta_r - whole, normal, theta_p),
-        _turning(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
+        _rotation_variant(hinge, theta_r - whole, normal, theta_p),
+        _rotation_variant(hinge, theta_r, normal, theta_p - math.copysign(whole, theta_p)),
         single_back,
     )
 
 
-def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
+def _rotation_variant(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: float) -> FloatArray:
     out = np.empty(8)
     out[:3], out[3], out[4:7], out[7] = hinge, theta_r, normal, theta_p
     return out
@@ -306,7 +316,7 @@ def _turning(hinge: FloatArray, theta_r: float, normal: FloatArray, theta_p: flo
 @kernel
 def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatArray, float, float]:
     """Hinge axis (3,), hinge and planar angle of a rotation ``(axis, angle)`` (4,) of the face of ``normal`` (3,)."""
-    R = turn(rotation[:3], rotation[3])
+    R = axis_rotation(rotation[:3], rotation[3])
     after = np.empty(3)
     for i in range(3):
         after[i] = R[i, 0] * normal[0] + R[i, 1] * normal[1] + R[i, 2] * normal[2]
@@ -326,7 +336,7 @@ def _hinge_and_planar(rotation: FloatArray, normal: FloatArray) -> tuple[FloatAr
         hinge = _cross(normal, other)
         hinge /= math.sqrt(_dot(hinge, hinge))
     theta_r = math.atan2(sine, cosine) if sine > PARALLEL or cosine < 0.0 else 0.0
-    back = turn(hinge, -theta_r)
+    back = axis_rotation(hinge, -theta_r)
     # the planar rotation R_p = R_r⁻¹ R, measured on a direction in the face
     inside = _cross(normal, hinge)
     image = np.empty(3)

@@ -102,7 +102,7 @@ def decompose(
     face, face_star = _face(A), _face(A_star)
     freedoms = arm_freedoms(operators)
     displacement = centre_star - centre
-    side, seeing = _sight(face, face_star, camera_centres)
+    side, seeing_cameras = _visible_side(face, face_star, camera_centres)
 
     translation = _nothing(operators, 0.0, ComponentStatus.DONE)
     tau = float(np.linalg.norm(displacement))
@@ -111,7 +111,7 @@ def decompose(
             primitive = translation_along_axis(operators, centre, centre + displacement / tau, freedoms)
             # (7.21) with the plane through the target whose normal is the motion of the centre
             tau = float(displacement @ (primitive.operator @ centre))
-            bound = _translation_bound(face, primitive.operator, centre, seeing)
+            bound = _translation_bound(face, primitive.operator, centre, seeing_cameras)
             translation = _component(primitive, tau, bound)
         except (NotReachableError, DegenerateStepError) as error:
             translation = _nothing(operators, tau, ComponentStatus.NOT_REACHABLE, str(error))
@@ -130,7 +130,7 @@ def decompose(
             theta = _hinge_angle(primitive.operator, a, a_t)
             theta = _visible_sense(primitive.operator, a, side, theta, camera_centres, displacement)
             primitive, theta = _positive(primitive, theta)
-            bound = _rotation_bound(face, primitive.operator, seeing)
+            bound = _rotation_bound(face, primitive.operator, seeing_cameras)
             hinge = _component(primitive, theta, bound)
             A_r = A_tc @ exp_rotation(primitive.operator, -theta).T  # (7.24)
         except (NotReachableError, DegenerateStepError) as error:
@@ -178,7 +178,7 @@ def _positive(primitive: Primitive, theta: float) -> tuple[Primitive, float]:
     return flipped, -theta
 
 
-def _sight(face: FloatArray, face_star: FloatArray, camera_centres: FloatArray) -> tuple[float, FloatArray]:
+def _visible_side(face: FloatArray, face_star: FloatArray, camera_centres: FloatArray) -> tuple[float, FloatArray]:
     """The sign of the face's visible side, and the centres of the cameras that see it now and at the target, times that
     sign.
 
@@ -191,15 +191,15 @@ def _sight(face: FloatArray, face_star: FloatArray, camera_centres: FloatArray) 
     return side, side * camera_centres[both]
 
 
-def _translation_bound(face: FloatArray, H_t: FloatArray, centre: FloatArray, seeing: FloatArray) -> float:
+def _translation_bound(face: FloatArray, H_t: FloatArray, centre: FloatArray, camera_centres: FloatArray) -> float:
     """Smallest τ₀ > 0 at which the translated face passes a camera: ``τ₀ = aᵀO/(aᵀĤ_tO)`` (7.21, the plane
     moves).
     """
     bound = math.inf
-    for eye in seeing:
-        rate = float(face @ (H_t @ eye))
+    for camera_centre in camera_centres:
+        rate = float(face @ (H_t @ camera_centre))
         if rate > 0.0:
-            bound = min(bound, float(face @ eye) / rate)
+            bound = min(bound, float(face @ camera_centre) / rate)
     return bound
 
 
@@ -246,11 +246,11 @@ def _angle(u: FloatArray, v: FloatArray, right: FloatArray) -> float:
     return math.atan2(sine, cosine)
 
 
-def _front(H: FloatArray, a: FloatArray, eye: FloatArray) -> tuple[float, float, float]:
-    """``k, R, φ`` of ``a(θ)ᵀO = k + R cos(θ − φ)``: the face turned by θ, seen from the static ``eye``."""
-    once = H @ eye
+def _facing_curve(H: FloatArray, a: FloatArray, camera_centre: FloatArray) -> tuple[float, float, float]:
+    """``k, R, φ`` of ``a(θ)ᵀO = k + R cos(θ − φ)``: the face turned by θ, seen from the static ``camera_centre``."""
+    once = H @ camera_centre
     u, v = float(a @ once), float(a @ (H @ once))
-    return float(a @ eye) + v, math.hypot(u, v), math.atan2(-u, -v)
+    return float(a @ camera_centre) + v, math.hypot(u, v), math.atan2(-u, -v)
 
 
 def _wrapped(angle: float) -> float:
@@ -272,20 +272,20 @@ def _visible_sense(
     """
     if camera_centres.shape[0] == 0:
         return theta
-    middle = side * camera_centres.mean(axis=0)
-    _, size, now = _front(H_r, a, middle)
-    _, size_then, then = _front(H_r, a, middle - side * displacement)
-    if min(size, size_then) <= COINCIDENT * float(np.linalg.norm(middle)):
+    mean_centre = side * camera_centres.mean(axis=0)
+    _, size, now = _facing_curve(H_r, a, mean_centre)
+    _, size_then, then = _facing_curve(H_r, a, mean_centre - side * displacement)
+    if min(size, size_then) <= COINCIDENT * float(np.linalg.norm(mean_centre)):
         return theta  # the cameras are on the axis: both senses are equivalent
     then = now + _wrapped(then - now)
     return then + _wrapped(theta - then)
 
 
-def _rotation_bound(face: FloatArray, H_r: FloatArray, seeing: FloatArray) -> float:
+def _rotation_bound(face: FloatArray, H_r: FloatArray, camera_centres: FloatArray) -> float:
     """Smallest θ₀ > 0 at which the turned face passes a camera (7.23 applied to the camera centre)."""
     bound = math.inf
-    for eye in seeing:
-        k, R, phi = _front(H_r, face, eye)
+    for camera_centre in camera_centres:
+        k, R, phi = _facing_curve(H_r, face, camera_centre)
         if k < R:
             bound = min(bound, max(0.0, phi + math.acos(max(-1.0, -k / R))))
     return bound

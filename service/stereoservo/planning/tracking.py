@@ -79,11 +79,11 @@ def interpolate_into(times: FloatArray, values: FloatArray, t_s: float, out: Flo
         return
     low, high = 0, K - 1
     while high - low > 1:
-        middle = (low + high) // 2
-        if times[middle] <= t_s:
-            low = middle
+        midpoint = (low + high) // 2
+        if times[midpoint] <= t_s:
+            low = midpoint
         else:
-            high = middle
+            high = midpoint
     h = times[high] - times[low]
     pace_low, pace_high = _pace_at(times, low), _pace_at(times, high)
     x = (t_s - times[low]) / h
@@ -115,8 +115,8 @@ def planned_joints(plan: Plan, begin_s: float, end_s: float, dt_s: float, joints
     left_s = float(plan.times[-1]) - begin_s
     if not left_s > 0.0:
         return PlannedJoints(np.zeros(0), np.zeros(0), 0.0)
-    here, there = sample_plan(plan, begin_s).joints, sample_plan(plan, end_s).joints
-    return PlannedJoints((there - here) / dt_s, here - joints, min(1.0, left_s / FADE_S))
+    start, end = sample_plan(plan, begin_s).joints, sample_plan(plan, end_s).joints
+    return PlannedJoints((end - start) / dt_s, start - joints, min(1.0, left_s / FADE_S))
 
 
 def pace(lag: float) -> float:

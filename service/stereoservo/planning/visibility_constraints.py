@@ -282,7 +282,7 @@ def read_constraints(
     sides, grazing = _required_visibility(body, goal, faces, camera_centres)
     constraints = Constraints(
         body=body,
-        must_stay_visible=writable_copy(r.kept),
+        must_stay_visible=writable_copy(r.must_stay_visible),
         cameras=cameras,
         camera_centres=camera_centres,
         sizes=writable_copy(limits.sizes),
@@ -297,7 +297,7 @@ def read_constraints(
         upper=writable_copy(np.maximum(limits.position_max, r.joints)),
         keep_outs=writable_copy(limits.keep_outs).reshape(-1, len(r.joints), 2),
     )
-    refusal = _refusal(constraints, body, goal)
+    refusal = _violation(constraints, body, goal)
     if refusal is None:
         for points in (body, goal):
             clearance = _image_clearances(constraints, points) - YIELD_PX
@@ -393,7 +393,7 @@ def _outside(body: FloatArray, face: IntArray, centroid: FloatArray, size: float
     return -1.0 if distance > 0.0 else 1.0
 
 
-def _refusal(constraints: Constraints, body: FloatArray, goal: FloatArray) -> ClosestApproach | None:
+def _violation(constraints: Constraints, body: FloatArray, goal: FloatArray) -> ClosestApproach | None:
     for path_parameter, points in ((0.0, body), (1.0, goal)):
         table = empty_table()
         broken = int(check_view(points, path_parameter, constraints, table, False))

@@ -50,7 +50,7 @@ from stereoservo.numerics.arrays import FloatArray
 CELL_FRAME = "cell"
 SEEN = Color(r=0.1, g=0.9, b=0.2, a=1.0)
 PREDICTED = Color(r=1.0, g=0.6, b=0.0, a=1.0)
-WANTED = Color(r=1.0, g=0.1, b=0.3, a=1.0)
+SET_POINTS = Color(r=1.0, g=0.1, b=0.3, a=1.0)
 AXIS = Color(r=0.2, g=0.5, b=1.0, a=1.0)
 FAULTS = {"fault", "goal_aborted", "reanchor_failed", "calibration_aborted"}
 """Events that a log shows as errors."""
@@ -173,14 +173,15 @@ def markers_seen(
     t_ns: int,
     seen: FloatArray,
     predicted: FloatArray | None = None,
-    wanted: FloatArray | None = None,
+    set_points: FloatArray | None = None,
 ) -> Published:
-    """Markers in a camera's picture: ``seen``, ``predicted`` and set-points ``wanted``, each (k, 2) raw pixels [px].
+    """Markers in a camera's picture: ``seen``, ``predicted`` and set-points ``set_points``, each (k, 2) raw pixels
+    [px].
 
     Foxglove counts pixels from the corner of a picture, this project from the centre of its first pixel.
     """
     drawn = []
-    for pixels, colour, size in ((seen, SEEN, 5.0), (predicted, PREDICTED, 3.0), (wanted, WANTED, 7.0)):
+    for pixels, colour, size in ((seen, SEEN, 5.0), (predicted, PREDICTED, 3.0), (set_points, SET_POINTS, 7.0)):
         if pixels is None or not len(pixels):
             continue
         points = [Point2(x=float(u) + 0.5, y=float(v) + 0.5) for u, v in pixels if np.isfinite(u + v)]
@@ -230,9 +231,9 @@ class MetricScene:
         """Directions (n, 3) of the joints' axes at ``positions`` (n,), and a point (n, 3) of each near the markers."""
         operators = self._frame @ self._chain.operators_at(positions) @ self._back
         found = joint_axes(self._model.joint_kinds, operators)
-        middle = self.markers(positions).mean(axis=0)
-        points = np.where(np.isnan(found.points), middle, found.points)
-        along = np.sum((middle - points) * found.directions, axis=1, keepdims=True)
+        centroid = self.markers(positions).mean(axis=0)
+        points = np.where(np.isnan(found.points), centroid, found.points)
+        along = np.sum((centroid - points) * found.directions, axis=1, keepdims=True)
         return found.directions, points + along * found.directions
 
     def transforms(self, t_ns: int) -> Published:
@@ -274,7 +275,7 @@ class MetricScene:
                 t_ns,
                 "cameras",
                 lines=cameras,
-                texts=_names([camera.name for camera in self._model.cameras], self.centres, size, WANTED),
+                texts=_names([camera.name for camera in self._model.cameras], self.centres, size, SET_POINTS),
             ),
         ]
         return Published("/scene", t_ns, SceneUpdate(entities=entities))
@@ -312,7 +313,7 @@ def _camera(centre: FloatArray, rotation: FloatArray) -> LinePrimitive:
         type=LinePrimitiveLineType.LineStrip,
         pose=_pose(np.zeros(3)),
         thickness=0.005,
-        color=WANTED,
+        color=SET_POINTS,
         points=[_point(place) for place in strip],
     )
 

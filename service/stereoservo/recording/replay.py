@@ -202,7 +202,7 @@ def _of_another_version(cause: str, recorded: Fingerprint | None) -> str:
     by = "an unknown version" if recorded is None else f"stereoservo {recorded.stereoservo}"
     return (
         f"cannot be replayed by {now}: {cause}. The file is not damaged; it was written by "
-        f"{'another build of ' if by == now else ''}{by}. Replay it with the version that wrote it, or record anew"
+        f"{'another build of ' if by == now else ''}{by}. Replay it with the version that wrote it, or record again"
     )
 
 

@@ -111,7 +111,7 @@ class FlightRing:
             self._move_aside()
         if self._segment is not None and not 0 <= message.t_ns - self._begun_ns < SEGMENT_S * 1e9:
             self._end()
-        if not self._has_room():
+        if not self._has_space():
             return
         if self._segment is None:
             self._begin(message.t_ns)
@@ -151,7 +151,7 @@ class FlightRing:
         if trouble != before:
             self._report("warning", f"the flight ring in {self.segments} is not written: {trouble}")
 
-    def _has_room(self) -> bool:
+    def _has_space(self) -> bool:
         place = self.segments
         while not place.exists():
             place = place.parent
@@ -196,8 +196,8 @@ class RingThread:
     """
 
     def __init__(self, directory: Path, limits: RingLimits) -> None:
-        self.said: deque[tuple[str, str]] = deque(maxlen=64)
-        self._ring = FlightRing(directory, limits, lambda kind, message: self.said.append((kind, message)))
+        self.reports: deque[tuple[str, str]] = deque(maxlen=64)
+        self._ring = FlightRing(directory, limits, lambda kind, message: self.reports.append((kind, message)))
         self._waiting: deque[StepMessage | int] = deque()
         self._bytes = self._lost = 0
         self._idle = False

@@ -1,10 +1,10 @@
 """Layout of a step record: the bytes that the loop writes for each step, with fixed places for all usual data, so that
 no encoder is needed and records of a kind can be compared word by word.
 
-A record is a multiple of 8 bytes, little-endian: the head (``HEAD``); the velocity before and after the safety stage;
-of joints stamps, positions, velocities, efforts, following errors; of each observation a head, the camera's name, ids,
-pixels, covariances. Rare data (requests, a model, a fault of the driver, velocities that it sent in place of a command,
-samples of other types) follow in msgpack.
+A record is a multiple of 8 bytes, little-endian: the header (``HEADER``); the velocity before and after the safety
+stage; of joints stamps, positions, velocities, efforts, following errors; of each observation a head, the camera's
+name, ids, pixels, covariances. Rare data (requests, a model, a fault of the driver, velocities that it sent in place of
+a command, samples of other types) follow in msgpack.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ LAYOUT = 3
 """Layout number, the first byte of a record. Records of layout 2 have the same content with another checksum; older
 records in msgpack start with another byte.
 """
-HEAD = struct.Struct("<BBBBIqqqqIHH")
+HEADER = struct.Struct("<BBBBIqqqqIHH")
 """Layout, flags, joints of a velocity, observations, CRC of the outputs; step, now, period, parameter epoch; bytes of
 the rest, joints of a sample, a mark of the cameras whose observations follow.
 """
 SAMPLE = struct.Struct("<qq")
 """Sequence number, and time minus that of the step."""
-SIGHT = struct.Struct("<IIqqq")
+OBSERVATION = struct.Struct("<IIqqq")
 """Bytes of the camera's name, markers; sequence number, times of shutter and receipt minus that of the step."""
 STOP, CONFIGURED, ACTIVE, COMPILING, COMMAND, JOINTS, EFFORTS, FOLLOWING = (1 << k for k in range(8))
 LARGEST_COUNT = 255
@@ -58,20 +58,20 @@ class StepRecord(msgspec.Struct, frozen=True, eq=False, array_like=True):
 
 
 _FLOAT, _INTEGER = np.dtype(np.float64), np.dtype(np.int64)
-_head, _sample, _sight = HEAD.pack, SAMPLE.pack, SIGHT.pack
+_header, _sample, _observation = HEADER.pack, SAMPLE.pack, OBSERVATION.pack
 _old_decoder = msgspec.msgpack.Decoder(StepRecord, dec_hook=decode_array)
 _rest_decoder = msgspec.msgpack.Decoder(StepInputs, dec_hook=decode_array)
 
 
-def _fields(*wanted: Any) -> tuple[str, ...]:
+def _fields(*types: Any) -> tuple[str, ...]:
     """Names of the status's fields of these types."""
-    return tuple(field.name for field in msgspec.structs.fields(Status) if field.type in wanted)
+    return tuple(field.name for field in msgspec.structs.fields(Status) if field.type in types)
 
 
 _ARRAYS, _NUMBERS = _fields(FloatArray, FloatArray | None), _fields(float | None)
-_APART = (*_ARRAYS, *_NUMBERS, "t_ns", "step", "reasons", "innovation_px", "health")
-_WORDS = tuple(name for name in Status.__struct_fields__ if name not in _APART)
-_arrays, _numbers, _words = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrgetter(*_WORDS)
+_SEPARATE = (*_ARRAYS, *_NUMBERS, "t_ns", "step", "reasons", "innovation_px", "health")
+_STRINGS = tuple(name for name in Status.__struct_fields__ if name not in _SEPARATE)
+_arrays, _numbers, _strings = attrgetter(*_ARRAYS), attrgetter(*_NUMBERS), attrgetter(*_STRINGS)
 
 
 def result_crc(result: StepResult) -> int:
@@ -104,7 +104,7 @@ def _all_outputs_crc(outputs: StepOutputs) -> int:
         parts += (prior.camera.encode(), prior.ids, prior.pixels, prior.velocities, prior.covariances)
     if status.reasons or outputs.events or outputs.driver_request:
         parts.append(encode((status.reasons, outputs.events, outputs.driver_request)))
-    return zlib.crc32(_joined(parts), zlib.crc32(encode((_words(status), status.health))))
+    return zlib.crc32(_joined(parts), zlib.crc32(encode((_strings(status), status.health))))
 
 
 def encode_step(inputs: StepInputs, result: StepResult) -> bytes:
@@ -123,14 +123,14 @@ def encode_step(inputs: StepInputs, result: StepResult) -> bytes:
             flags |= EFFORTS
         if joints.following_errors is not None:  # type: ignore[union-attr]
             flags |= FOLLOWING
-    usual = not seen or _add_sights(parts, seen, inputs.now_ns)
+    usual = not seen or _add_observations(parts, seen, inputs.now_ns)
     mark = zlib.crc32("\0".join([one.camera for one in seen]).encode()) & 0xFFFF if seen else 0
     rest = b""
     rare = inputs.requests or inputs.model_update or inputs.driver_fault or inputs.sent is not None
     if rare or not usual or (joints is not None and not n):
         rest = _rest(inputs, joints=n == 0, observations=not usual)
         parts.append(rest)
-    parts[0] = _head(
+    parts[0] = _header(
         LAYOUT, flags, len(raw), len(seen) if usual else 0, result_crc(result), result.step, inputs.now_ns,
         inputs.period_ns, inputs.parameter_epoch, len(rest), n, mark,
     )  # fmt: skip
@@ -170,7 +170,7 @@ def _add_sample(parts: list[Any], joints: JointState, now_ns: int) -> int:
     return len(positions)
 
 
-def _add_sights(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: int) -> bool:
+def _add_observations(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: int) -> bool:
     """Add observations if the layout supports their arrays; otherwise adds nothing and returns False."""
     added: list[Any] = []
     for observation in seen:
@@ -186,7 +186,7 @@ def _add_sights(parts: list[Any], seen: tuple[CameraObservation, ...], now_ns: i
             return False
         times = observation.t_shutter_ns - now_ns, observation.t_received_ns - now_ns
         try:
-            added.append(_sight(len(name), k, observation.seq, *times))
+            added.append(_observation(len(name), k, observation.seq, *times))
         except struct.error:  # a stamp out of range
             return False
         added += (_padded(name), ids, pixels, covariances)
@@ -238,7 +238,7 @@ class _Reader:
 
 def form_of(record: bytes) -> int:
     """A number that is equal for records of the same length with the same content in the same places."""
-    return zlib.crc32(record[1:4] + record[HEAD.size - 2 : HEAD.size])
+    return zlib.crc32(record[1:4] + record[HEADER.size - 2 : HEADER.size])
 
 
 def decode_step(data: bytes) -> StepRecord:
@@ -246,11 +246,11 @@ def decode_step(data: bytes) -> StepRecord:
     if data[:1] not in (b"\2", bytes((LAYOUT,))):
         return _old_decoder.decode(data)
     reader = _Reader(data)
-    layout, flags, m, cameras, crc, step, now_ns, period_ns, epoch, rest, n, _ = reader.unpack(HEAD)
+    layout, flags, m, cameras, crc, step, now_ns, period_ns, epoch, rest, n, _ = reader.unpack(HEADER)
     raw = reader.array(np.float64, m)
     command = reader.array(np.float64, m) if flags & COMMAND else None
     joints = _read_joints(reader, flags, n, now_ns) if flags & JOINTS else None
-    observations = tuple(_read_sight(reader, now_ns) for _ in range(cameras))
+    observations = tuple(_read_observation(reader, now_ns) for _ in range(cameras))
     if reader.left != rest:
         raise ValueError(f"a record with {reader.left} bytes left, which says {rest}")
     inputs = StepInputs(
@@ -275,8 +275,8 @@ def _read_joints(reader: _Reader, flags: int, n: int, now_ns: int) -> JointState
     return JointState(seq, now_ns + before_ns, positions, velocities, efforts, following)
 
 
-def _read_sight(reader: _Reader, now_ns: int) -> CameraObservation:
-    length, k, seq, shutter_ns, received_ns = reader.unpack(SIGHT)
+def _read_observation(reader: _Reader, now_ns: int) -> CameraObservation:
+    length, k, seq, shutter_ns, received_ns = reader.unpack(OBSERVATION)
     name = reader.take(length + -length % 8)[:length].decode()
     return CameraObservation(
         name,

@@ -71,7 +71,7 @@ def _processor() -> str:
 
 
 CHECKPOINT_EVERY_S = 5.0
-TRY_AGAIN_S = 0.1
+RETRY_S = 0.1
 """Interval [s] after a checkpoint that the recorder could not take: encoding one takes time for the whole state."""
 
 
@@ -112,7 +112,7 @@ class StepSink(Protocol):
 
 class StepStream:
     """Sends each step, and a checkpoint at the start, every ``CHECKPOINT_EVERY_S`` and after a gap. A checkpoint that
-    the recorder could not take is made again after ``TRY_AGAIN_S``, and after a gap no step is sent before it.
+    the recorder could not take is made again after ``RETRY_S``, and after a gap no step is sent before it.
 
     ``dropped`` counts the steps that a recorder could not take.
     """
@@ -123,7 +123,7 @@ class StepStream:
         self._connected: StepSink | None = None
         self._sink: StepSink | None = None
         self._since_checkpoint = 0
-        self._try_again = max(1, round(TRY_AGAIN_S * rate_hz))
+        self._try_again = max(1, round(RETRY_S * rate_hz))
         self._pause = 0
         self._lost = 0
         self.dropped = 0

@@ -30,7 +30,7 @@ from stereoservo.web.model_view import ModelView
 from stereoservo.web.rights import LEASE_S, Leases
 
 POLL_S = 0.004
-AGAIN_S = 0.25
+RECONNECT_S = 0.25
 """Delay before another session is tried [s]; well below `LEASE_S`, so that a goal survives a failed session."""
 SILENT_S = 2.0
 INFO_EVERY_S = 0.5
@@ -113,40 +113,40 @@ class CellLink:
                 self._why = str(error)
             except Exception as error:  # whatever a cell sends: the pages are informed, and the link restarts
                 self._why = f"what the cell sends cannot be read: {type(error).__name__}: {error}"
-            self._tell("link", {"up": False, "why": self._why})
+            self._publish_slot("link", {"up": False, "why": self._why})
             client, self._client = self._client, None
             if client is not None:
                 closing = threading.Thread(target=client.close, name="cell-link-close", daemon=True)
                 closing.start()  # of a session that hangs: takes seconds, longer than a lease
                 if self._ended.is_set():
                     closing.join()
-            self._ended.wait(AGAIN_S)
+            self._ended.wait(RECONNECT_S)
 
     def _read(self, client: Client) -> None:
         """Publish what ``client`` receives, until the daemon ends. Raises ClientError."""
         self._epoch, self._goal = -1, ""
-        self._tell_info(client)
-        self._tell("link", {"up": True, "why": ""})
+        self._publish_info(client)
+        self._publish_slot("link", {"up": True, "why": ""})
         prefix = client.keys.prefix
         states = client.session.declare_subscriber(client.keys.state, RingChannel(4))
         features = client.session.declare_subscriber(f"{prefix}/features/*", RingChannel(32))
         pictures: Any = None
-        heard = info_due = time.monotonic()
+        last_message_s = info_due = time.monotonic()
         stale = False
         with EventWatch(client) as watch:
             while not self._ended.wait(POLL_S):
                 now = time.monotonic()
                 while (sample := states.try_recv()) is not None:
-                    heard = now
-                    self._take_state(client, sample.payload.to_bytes())
+                    last_message_s = now
+                    self._on_state(client, sample.payload.to_bytes())
                 while (sample := features.try_recv()) is not None:
-                    self._take_features(sample.payload.to_bytes())
+                    self._on_features(sample.payload.to_bytes())
                 for event in watch.poll():
-                    self._take_event(event)
+                    self._on_event(event)
                     stale = True
                 if stale and now > info_due:
                     stale, info_due = False, now + INFO_EVERY_S
-                    self._tell_info(client)
+                    self._publish_info(client)
                 if self.watched.is_set() != (pictures is not None):
                     if pictures is None:
                         pictures = client.session.declare_subscriber(f"{prefix}/preview/*", RingChannel(8))
@@ -154,20 +154,20 @@ class CellLink:
                         pictures.undeclare()
                         pictures = None
                 while pictures is not None and (sample := pictures.try_recv()) is not None:
-                    self._take_picture(sample)
-                if now - heard > SILENT_S:
+                    self._on_picture(sample)
+                if now - last_message_s > SILENT_S:
                     raise ClientError(f"cell {self.cell!r} has been silent for {SILENT_S:g} s")
 
-    def _take_state(self, client: Client, data: bytes) -> None:
+    def _on_state(self, client: Client, data: bytes) -> None:
         state = read_message("state", data, StateMessage)
         self._state, self._heard_s = state, time.monotonic()
         if state.model_epoch != self._epoch:
             self._load_model(client, state.model_epoch)
         refinement = "" if state.refinement is None else state.refinement.text
-        told = {"state": msgspec.Raw(data), "refinement": refinement, **self.view.at(state)}
-        self._tell("state", told, keep=True)
+        message = {"state": msgspec.Raw(data), "refinement": refinement, **self.view.at(state)}
+        self._publish_slot("state", message, keep=True)
         if state.goal != self._goal:
-            self._tell_goal(client, state.goal)
+            self._publish_goal(client, state.goal)
 
     def _load_model(self, client: Client, epoch: int) -> None:
         self._epoch = epoch
@@ -179,46 +179,46 @@ class CellLink:
         except NoReplyError:
             raise  # requested again over another session
         except (ClientError, ModelFileError) as error:
-            self._tell("", {"notice": f"the model cannot be shown: {error}", "t_wall": time.time()})
+            self._publish_slot("", {"notice": f"the model cannot be shown: {error}", "t_wall": time.time()})
             return
         self.view = ModelView.of(model, self.info)
 
-    def _take_features(self, data: bytes) -> None:
+    def _on_features(self, data: bytes) -> None:
         found = read_message("features", data, FeaturesMessage)
         self._seen[found.camera] = found
-        self._tell(f"features {found.camera}", {"features": msgspec.Raw(data)})
+        self._publish_slot(f"features {found.camera}", {"features": msgspec.Raw(data)})
 
-    def _take_event(self, event: EventMessage) -> None:
-        self._leases.take_event(event)
+    def _on_event(self, event: EventMessage) -> None:
+        self._leases.on_event(event)
         if event.kind.endswith(("_aborted", "_failed")):
             at = time.strftime("%H:%M:%S", time.localtime(event.t_wall))
             self._log(f"{at} {event.kind} {event.id}: {why(event)}")
-        self._tell("", {"event": event})
+        self._publish_slot("", {"event": event})
 
-    def _tell_goal(self, client: Client, goal: str) -> None:
+    def _publish_goal(self, client: Client, goal: str) -> None:
         """Publish the drawing data of a ``goal`` that has started, whoever sent it."""
         self._goal = goal
         try:
             running = client.running_goals() if goal else ()
         except ClientError as error:  # e.g. of an older daemon
-            self._tell("", {"notice": f"goal {goal} cannot be drawn: {error}", "t_wall": time.time()})
+            self._publish_slot("", {"notice": f"goal {goal} cannot be drawn: {error}", "t_wall": time.time()})
             return
         for one in running:
             if one.goal.id == goal:
-                self._tell("goal", self.view.goal(one.goal, one.plan), keep=True)
+                self._publish_slot("goal", self.view.goal(one.goal, one.plan), keep=True)
 
-    def _take_picture(self, sample: Any) -> None:
+    def _on_picture(self, sample: Any) -> None:
         if sample.attachment is None:  # not a picture of a camera process
             return
         camera = str(sample.key_expr).rpartition("/")[2]
         data = picture_message(sample.attachment.to_bytes(), sample.payload.to_bytes())
         self._publish(f"picture {camera}", data, False)
 
-    def _tell_info(self, client: Client) -> None:
+    def _publish_info(self, client: Client) -> None:
         self.info = client.info()
-        self._tell("info", {"info": self.info}, keep=True)
+        self._publish_slot("info", {"info": self.info}, keep=True)
 
-    def _tell(self, slot: str, tree: dict[str, Any], keep: bool = False) -> None:
+    def _publish_slot(self, slot: str, tree: dict[str, Any], keep: bool = False) -> None:
         self._publish(slot, msgspec.json.encode(tree), keep or slot == "link")
 
     # -- commands ---------------------------------------------------------------------------------------------
@@ -257,8 +257,8 @@ class CellLink:
             )
             found = {
                 marker: (float(u), float(v))
-                for marker, (u, v), there in zip(model.model.marker_ids, pixels, inside, strict=True)
-                if there and marker in seen
+                for marker, (u, v), visible in zip(model.model.marker_ids, pixels, inside, strict=True)
+                if visible and marker in seen
             }
             if len(found) < 3:
                 raise GeometryError(

@@ -10,7 +10,7 @@ import numpy as np
 from stereoservo.geometry.cameras import camera_centre, project_many
 from stereoservo.geometry.distortion import distort, undistort
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.kinematics.axes import euclidean_centres, framed, joint_axes
+from stereoservo.kinematics.axes import euclidean_centres, framed_model, joint_axes
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Goal, PlanReport
@@ -48,7 +48,7 @@ class ModelView:
         """
         points = None
         if self.scene is not None and plan is not None and len(plan.joints) == len(self.scene.chain.kinds):
-            points = self.scene.markers(np.array([way[-1] for way in plan.joints.values()])).tolist()
+            points = self.scene.markers(np.array([positions[-1] for positions in plan.joints.values()])).tolist()
         stated = getattr(goal.target, "set_points", {})
         return {"goal": {"id": goal.id, "plan": plan, "set_points": stated, "scene": points}}
 
@@ -143,19 +143,19 @@ class DragModel:
         is the least-squares one over all pictures (Levenberg-Marquardt, clipped to the limits). Raises GeometryError.
         """
         c = self._index(camera)
-        wanted = project_many(self._Ps, self._wanted(c, self._points(start), np.array(shift), turn, nearer))
-        if not np.isfinite(wanted).all():
+        required = project_many(self._Ps, self._required_points(c, self._points(start), np.array(shift), turn, nearer))
+        if not np.isfinite(required).all():
             raise GeometryError("outside", f"the body is dragged into the focal plane of {camera}", camera=camera)
-        joints = self._fitted(start, wanted)
+        joints = self._fitted(start, required)
         reached = self._ideal(joints)
-        left = float(np.sqrt(((reached[c] - wanted[c]) ** 2).sum(axis=-1).mean()))
+        left = float(np.sqrt(((reached[c] - required[c]) ** 2).sum(axis=-1).mean()))
         return DraggedGoal(joints, self._raw(reached), left)
 
-    def _wanted(self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float) -> FloatArray:
+    def _required_points(self, c: int, points: FloatArray, shift: FloatArray, turn: float, nearer: float) -> FloatArray:
         """Markers (m, 4) requested by `dragged`; the arm may be unable to make this displacement."""
         lens, P = self.model.cameras[c].lens, self._Ps[c, None]
-        middle = points.mean(axis=0)
-        centre = project_many(P, middle[None])[0]
+        centroid = points.mean(axis=0)
+        centre = project_many(P, centroid[None])[0]
         asked = undistort(lens, distort(lens, centre) + shift)
         if not np.isfinite(asked).all():
             raise GeometryError(
@@ -164,9 +164,9 @@ class DragModel:
                 camera=self.cameras[c],
             )
         cosine, sine = np.cos(turn), np.sin(turn)
-        turned = centre + (project_many(P, points)[0] - centre) @ np.array([[cosine, sine], [-sine, cosine]])
-        goal = self._on_rays(c, asked, nearer * middle[None] @ self._Ps[c, 2])[0]
-        placed: FloatArray = self._on_rays(c, turned, points @ self._Ps[c, 2]) + (goal - middle)
+        rotated = centre + (project_many(P, points)[0] - centre) @ np.array([[cosine, sine], [-sine, cosine]])
+        goal = self._on_rays(c, asked, nearer * centroid[None] @ self._Ps[c, 2])[0]
+        placed: FloatArray = self._on_rays(c, rotated, points @ self._Ps[c, 2]) + (goal - centroid)
         return placed
 
     def _on_rays(self, c: int, ideal: FloatArray, depths: FloatArray) -> FloatArray:
@@ -215,11 +215,11 @@ class DragModel:
         lines: FloatArray = np.cross(epipole, (self._Ps[k] @ ray).T)
         return lines
 
-    def _fitted(self, start: FloatArray, wanted: FloatArray) -> FloatArray:
-        """Joints (n,) within the limits with ideal pixels nearest to ``wanted`` (c, m, 2)."""
+    def _fitted(self, start: FloatArray, required: FloatArray) -> FloatArray:
+        """Joints (n,) within the limits with ideal pixels nearest to ``required`` (c, m, 2)."""
         low, high = self.limits.T
         q = np.clip(start, low, high)
-        residual = (wanted - self._ideal(q)).ravel()
+        residual = (required - self._ideal(q)).ravel()
         damping = DAMPING
         for _ in range(ITERATIONS):
             J = self._chain.image_jacobian(self._Ps, q, self._points(q)).reshape(len(residual), -1)
@@ -232,7 +232,7 @@ class DragModel:
             tried = q.copy()
             tried[free] += np.linalg.solve(A, downhill[free])
             tried = np.clip(tried, low, high)
-            left = (wanted - self._ideal(tried)).ravel()
+            left = (required - self._ideal(tried)).ravel()
             if not left @ left < residual @ residual:  # NaN in a focal plane: not an improvement
                 damping *= 10.0
                 if damping > LARGEST_DAMPING:
@@ -255,8 +255,8 @@ def _feet(lines: FloatArray, pixels: FloatArray) -> FloatArray:
 
 def _across(line: FloatArray, width: int, height: int) -> FloatArray:
     """Points (k, 2) along a line (3,) across the picture and slightly beyond."""
-    middle = 0.5 * np.array([[width, height]])
-    foot = _feet(line[None], middle)[0]
+    centre = 0.5 * np.array([[width, height]])
+    foot = _feet(line[None], centre)[0]
     along = np.array([-line[1], line[0]]) / np.hypot(line[0], line[1])
     reach = 0.75 * np.hypot(width, height)
     points: FloatArray = foot + np.linspace(-reach, reach, LINE_STEPS)[:, None] * along
@@ -280,7 +280,7 @@ class Scene:
         """The scene of ``model``; None if it is not metric, or its cameras are mounted on the arm."""
         if model.stratum != "metric" or model.tip_first:
             return None
-        parts = framed(model)
+        parts = framed_model(model)
         directions = parts.cameras[:, 2, :3] * np.sign(np.linalg.det(parts.cameras[:, :, :3]))[:, None]
         directions /= np.linalg.norm(directions, axis=1)[:, None]
         cameras = [
@@ -299,9 +299,9 @@ class Scene:
         """Axes (a point near the markers, a direction), markers and cameras at ``joints`` (n,)."""
         markers = self.markers(joints)
         axes = joint_axes(self.chain.kinds, self.chain.operators_at(joints))
-        middle = markers.mean(axis=0)
-        origins = np.where(np.isfinite(axes.points), axes.points, middle)
-        along = ((middle - origins) * axes.directions).sum(axis=1)
+        centroid = markers.mean(axis=0)
+        origins = np.where(np.isfinite(axes.points), axes.points, centroid)
+        along = ((centroid - origins) * axes.directions).sum(axis=1)
         nearest = origins + along[:, None] * axes.directions
         return {
             "axes": [[p.tolist(), d.tolist()] for p, d in zip(nearest, axes.directions, strict=True)],

@@ -201,7 +201,7 @@ class Leases:
             if motion in self._accepted:
                 self._accepted[motion] = True
 
-    def take_event(self, event: EventMessage) -> None:
+    def on_event(self, event: EventMessage) -> None:
         """Stop renewing a motion that ``event`` ends, or that the daemon no longer has (its end was not received)."""
         unknown = event.kind == "goal_refused" and any(reason.code == "NO_SUCH_GOAL" for reason in event.reasons)
         if event.kind in ENDS or (unknown and event.id in self.renewed):

@@ -52,7 +52,7 @@ MAX_REQUEST_BYTES = 1 << 14
 MAX_WAITING = 512
 TICK_S = 0.2
 """Interval of messages to pages that the server is alive, with the time since the cell's last state [s]."""
-MAX_UNDER_WAY, MAX_STOPS = 8, 32
+MAX_IN_PROGRESS, MAX_STOPS = 8, 32
 """Largest numbers of concurrent requests of a page, and of stops, which do not wait for the requests."""
 EVENTS_KEPT = 100
 CLOSING_S = 2.0
@@ -72,7 +72,7 @@ EXPECTED = (
 
 
 class RecordedLink(Protocol):
-    """Interface of a recording in place of a cell, `web.flight_link.FlightLink`: this module does not depend on
+    """Interface of a recording in place of a cell, `web.playback.PlaybackLink`: this module does not depend on
     recordings.
     """
 
@@ -114,21 +114,21 @@ class Page:
         self.checked: Goal | None = None
         self.changes = 0
         """Number of drags and checks so far: a checked goal is sent only if none came in between."""
-        self._under_way = 0
+        self._in_progress = 0
 
     @contextmanager
-    def under_way(self, what: str) -> Iterator[None]:
+    def in_progress(self, what: str) -> Iterator[None]:
         """Context manager of a request in progress. Raises RightsError if too many are."""
-        if self._under_way >= MAX_UNDER_WAY:
+        if self._in_progress >= MAX_IN_PROGRESS:
             raise RightsError(
-                f"{what}: {self._under_way} requests of this page are being carried out, {MAX_UNDER_WAY} are allowed: "
+                f"{what}: {self._in_progress} requests of this page are in progress, {MAX_IN_PROGRESS} are allowed: "
                 "wait for one of them; stop goes before all"
             )
-        self._under_way += 1
+        self._in_progress += 1
         try:
             yield
         finally:
-            self._under_way -= 1
+            self._in_progress -= 1
 
     def put(self, slot: str, data: bytes) -> None:
         """Queue a message that replaces an older one of the same slot."""
@@ -138,7 +138,7 @@ class Page:
             self.waiting.append(data)
         self.wake.set()
 
-    def tell(self, tree: Any) -> None:
+    def append_message(self, tree: Any) -> None:
         """Queue a message that is not replaced."""
         self.put("", msgspec.json.encode(tree))
 
@@ -233,9 +233,9 @@ class PageServer:
     def _publish(self, slot: str, data: bytes, keep: bool) -> None:
         """Publish a message; called by the link's thread."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(self._spread, slot, data, keep)
+            self._loop.call_soon_threadsafe(self._broadcast, slot, data, keep)
 
-    def _spread(self, slot: str, data: bytes, keep: bool) -> None:
+    def _broadcast(self, slot: str, data: bytes, keep: bool) -> None:
         if keep:
             self._kept[slot] = data
         elif not slot:
@@ -246,14 +246,14 @@ class PageServer:
     async def _tick(self) -> None:
         while True:
             tick = {"t_wall": time.time(), "silent_s": round(self.link.silent_s, 3)}
-            self._spread("tick", msgspec.json.encode({"tick": tick}), False)
+            self._broadcast("tick", msgspec.json.encode({"tick": tick}), False)
             await asyncio.sleep(TICK_S)
 
     async def _session(self, connection: ServerConnection) -> None:
         page = Page(f"viewer {next(self._numbers)}")
         self._pages.add(page)
         self.link.watched.set()
-        self._tell_rights(page)
+        self._send_rights(page)
         page.waiting.extend(self._events)
         for slot, data in self._kept.items():
             page.put(slot, data)
@@ -264,7 +264,7 @@ class PageServer:
                 task = asyncio.create_task(self._answer(page, message))
                 tasks.add(task)
                 task.add_done_callback(tasks.discard)
-                if len(tasks) > MAX_UNDER_WAY + MAX_STOPS:
+                if len(tasks) > MAX_IN_PROGRESS + MAX_STOPS:
                     await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         except ConnectionClosed:
             pass
@@ -273,14 +273,14 @@ class PageServer:
             self._pages.discard(page)
             if self.holder.release(page):
                 self.link.end_leases()
-                self._tell_all_rights()
-                self._spread("", _gone(connection), False)
+                self._send_rights_to_all()
+                self._broadcast("", _holder_closed(connection), False)
             if not self._pages:
                 self.link.watched.clear()
 
-    def _tell_rights(self, page: Page) -> None:
+    def _send_rights(self, page: Page) -> None:
         operator = self.holder.operator
-        page.tell(
+        page.append_message(
             {
                 "rights": {
                     "operator": operator,
@@ -292,9 +292,9 @@ class PageServer:
             }
         )
 
-    def _tell_all_rights(self) -> None:
+    def _send_rights_to_all(self) -> None:
         for page in self._pages:
-            self._tell_rights(page)
+            self._send_rights(page)
 
     async def _answer(self, page: Page, message: str | bytes) -> None:
         """Execute a page's request, as far as it is allowed, and send the page the result."""
@@ -305,27 +305,27 @@ class PageServer:
             request = decode_request(data)
             if self.link.recording is True:
                 answer = {"ok": True} | _playback(self.link, request)
-                page.tell({"answer": {"n": n, **answer}})
+                page.append_message({"answer": {"n": n, **answer}})
                 return
             if not isinstance(request, OPEN):
                 self.holder.require(page, str(request.__struct_config__.tag))
             if isinstance(request, Stop):
                 answer = {"ok": True} | await self._run(self._stops, page, request)
             else:
-                with page.under_way(str(request.__struct_config__.tag)):
+                with page.in_progress(str(request.__struct_config__.tag)):
                     answer = {"ok": True} | await self._run(self._work, page, request)
         except EXPECTED as error:
             answer = refusal(error)
         except Exception as error:  # sent to the page; the next request is answered as usual
             answer = {"ok": False, "message": f"the page's server failed: {type(error).__name__}: {error}"}
-        self._let_go(page)
-        page.tell({"answer": {"n": n, **answer}})
+        self._release_page(page)
+        page.append_message({"answer": {"n": n, **answer}})
 
     async def _run(self, pool: ThreadPoolExecutor, page: Page, request: PageRequest) -> dict[str, Any]:
         assert self._loop is not None
         return await self._loop.run_in_executor(pool, self._do, page, request)
 
-    def _let_go(self, page: Page) -> None:
+    def _release_page(self, page: Page) -> None:
         """End what a page has started, when it was closed or has released the arm."""
         if page not in self._pages:
             self.holder.release(page)
@@ -338,7 +338,7 @@ class PageServer:
         match request:
             case Stop():
                 operator = self.holder.operator
-                return _told(link.stop(operator if operator and self.holder.holds(page) else page.name))
+                return _reply_fields(link.stop(operator if operator and self.holder.holds(page) else page.name))
             case Take():
                 self.holder.take(page, request.token)
                 self._rights_changed()
@@ -352,20 +352,20 @@ class PageServer:
                 link.client.enable()
                 return {"message": "enabled: the arm may move"}
             case Disable():
-                return _told(link.client.disable())
+                return _reply_fields(link.client.disable())
             case Hold():
-                return _told(link.client.hold())
+                return _reply_fields(link.client.hold())
             case Resume():
-                return _told(link.client.resume())
+                return _reply_fields(link.client.resume())
             case Reset():
                 link.client.reset()
                 return {"message": "the fault is cleared; enable switches on"}
             case Teach():
                 return {"message": link.client.teach(request.name).message}
             case Calibrate():
-                return _told(link.calibrate(request.check))
+                return _reply_fields(link.calibrate(request.check))
             case Cancel():
-                return _told(link.cancel())
+                return _reply_fields(link.cancel())
             case Drag():
                 return self._drag(page, request)
             case Check():
@@ -388,7 +388,7 @@ class PageServer:
 
     def _rights_changed(self) -> None:
         assert self._loop is not None
-        self._loop.call_soon_threadsafe(self._tell_all_rights)
+        self._loop.call_soon_threadsafe(self._send_rights_to_all)
 
     def _drag(self, page: Page, request: Drag) -> dict[str, Any]:
         model = self._cell_link.view.model
@@ -421,7 +421,7 @@ class PageServer:
         reply = link.client.check(goal)
         if page.changes == change:
             page.checked = goal
-        return _told(reply) | {"plan": reply.plan}
+        return _reply_fields(reply) | {"plan": reply.plan}
 
     def _go(self, page: Page) -> dict[str, Any]:
         goal = page.checked
@@ -433,7 +433,7 @@ class PageServer:
 
     def _send_goal(self, goal: Goal) -> dict[str, Any]:
         reply = self._cell_link.send(goal)
-        return _told(reply) | {"id": goal.id}
+        return _reply_fields(reply) | {"id": goal.id}
 
 
 async def _send(connection: ServerConnection, page: Page) -> None:
@@ -471,7 +471,7 @@ def _playback(link: RecordedLink, request: PageRequest) -> dict[str, Any]:
     )
 
 
-def _gone(connection: ServerConnection) -> bytes:
+def _holder_closed(connection: ServerConnection) -> bytes:
     """Notice to pages that the one that held the arm is closed."""
     lost = connection.close_code == CloseCode.ABNORMAL_CLOSURE
     how = f"lost its connection, or did not answer for {SILENT_S:g} s" if lost else "was closed"
@@ -480,7 +480,7 @@ def _gone(connection: ServerConnection) -> bytes:
     )
 
 
-def _told(reply: Reply) -> dict[str, Any]:
+def _reply_fields(reply: Reply) -> dict[str, Any]:
     return {"message": reply.message or "done"}
 
 

@@ -17,7 +17,7 @@ from stereoservo.calibration.rig_model import RigModel, full_charts, residuals, 
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.single_joint_fit import measurements
 from stereoservo.calibration.trial_data import TrialData
-from stereoservo.kinematics.axes import framed
+from stereoservo.kinematics.axes import framed_model
 from stereoservo_sim.benchmarks.timing import summary, timed
 from stereoservo_sim.progress import ProgressCall
 from stereoservo_sim.world.exact_model import exact_model
@@ -140,7 +140,7 @@ def _beside_scipy(
     """Duration of the metric bundle adjustment, ours and scipy's on the dense Jacobian of the same residuals, from one
     start.
     """
-    parts = framed(exact_model(cell))
+    parts = framed_model(exact_model(cell))
     truth = RigModel(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(trials, trials.visible, trials.positions - parts.zero)
     charts = full_charts(truth, "metric")

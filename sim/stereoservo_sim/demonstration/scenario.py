@@ -9,7 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from stereoservo.kinematics.joint_angles import measured_joints
-from stereoservo.kinematics.joint_reprojection import joint_problem, seen_chain
+from stereoservo.kinematics.joint_reprojection import joint_problem, observed_chain
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import DisplacementTarget, LawName, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
@@ -222,12 +222,12 @@ def joints_by_images(model: CellModel, operator: Operator) -> FloatArray:
         for marker, seen in sights[camera.name].items():
             if marker in model.marker_ids:
                 pixels[c, model.marker_ids.index(marker)] = np.mean(seen, axis=0)
-    problem = joint_problem(seen_chain(model), model.marker_points, pixels, SEEN_PX)
+    problem = joint_problem(observed_chain(model), model.marker_points, pixels, SEEN_PX)
     return measured_joints(problem, start=operator.joints(), largest_deviation=np.inf)[0].q
 
 
 def displacement_between(model: CellModel, here: FloatArray, there: FloatArray) -> DisplacementTarget:
     """Displacement of the marker body from its pose at joints ``here`` (n,) to that at ``there`` (n,)."""
-    chain = seen_chain(model).chain
+    chain = observed_chain(model).chain
     H = chain.displacement(there) @ np.linalg.inv(chain.displacement(here))
     return DisplacementTarget(tuple(H.ravel().tolist()), model_epoch=model.epoch)

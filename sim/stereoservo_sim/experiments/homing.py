@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_angles import homing_displacement, homing_problem, sensitivity
-from stereoservo.kinematics.joint_reprojection import JointAnglesError, SeenChain, seen_chain
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, ObservedChain, observed_chain
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.experiments.experiment import Comparison, of_limit
 from stereoservo_sim.experiments.figures import Figures, picture
@@ -71,7 +71,7 @@ class Homings:
 
 
 def homings(
-    seen: SeenChain,
+    seen: ObservedChain,
     calibration: HeadCalibration | None,
     home: FloatArray,
     home_pixels: FloatArray,
@@ -126,7 +126,7 @@ def run_homing(*, seeds: int, seed: int, progress: ProgressCall, trials: int = T
             calibration = calibrated(data)
             for name, seen, known in (
                 ("calibrated", calibration.seen, calibration),
-                ("perfect", seen_chain(exact_model(cell)), None),
+                ("perfect", observed_chain(exact_model(cell)), None),
             ):
                 found[name].append(homings(seen, known, cell.home, at_home, positions, pixels))
         except (CalibrationError, JointAnglesError) as error:

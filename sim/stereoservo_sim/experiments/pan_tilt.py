@@ -29,11 +29,11 @@ from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.rotation_fit import bundle_rotation
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.joint_reprojection import (
-    SeenChain,
+    ObservedChain,
+    observed_chain,
     pinhole_lenses,
-    points_seen,
     predicted_pixels,
-    seen_chain,
+    reconstruct_points,
 )
 from stereoservo.kinematics.model import CellModel, Stratum
 from stereoservo.numerics.arrays import BoolArray, FloatArray, ImageArray
@@ -208,25 +208,25 @@ class HeadCalibration:
     zero: FloatArray
 
     @property
-    def seen(self) -> SeenChain:
-        """Calibrated head as a `SeenChain`."""
+    def seen(self) -> ObservedChain:
+        """Calibrated head as a `ObservedChain`."""
         return _seen(self.solution.rig, self.zero)
 
-    def deviations(self) -> Iterator[tuple[SeenChain, SeenChain]]:
+    def deviations(self) -> Iterator[tuple[ObservedChain, ObservedChain]]:
         """The head one standard deviation to either side along each column of a root of the covariance of joints and
         cameras: the outer products of their effects add up to the effect of the calibration's noise.
         """
         charts = self.solution.charts
         size = charts.size - 3 * len(self.solution.rig.points)
-        rows = self.solution.determined.root[:size]
+        rows = self.solution.statistics.root[:size]
         for column in np.linalg.cholesky(rows @ rows.T).T:
             x = np.concatenate([column, np.zeros(charts.size - size)])
             yield tuple(_seen(rig_at(self.solution.rig, charts, sign * x), self.zero) for sign in (1, -1))  # type: ignore[misc]
 
 
-def _seen(rig: RigModel, zero: FloatArray) -> SeenChain:
+def _seen(rig: RigModel, zero: FloatArray) -> ObservedChain:
     chain = ProjectiveChain(("revolute", "revolute"), rig.generators[::-1], zero, tip_first=True)
-    return SeenChain(chain, rig.cameras, pinhole_lenses(len(rig.cameras)), ("pan", "tilt"))
+    return ObservedChain(chain, rig.cameras, pinhole_lenses(len(rig.cameras)), ("pan", "tilt"))
 
 
 def calibrated(trials: TrialData) -> HeadCalibration:
@@ -258,7 +258,7 @@ def _rig_of(model: CellModel) -> tuple[RigModel, Stratum]:
     return RigModel(("revolute", "revolute"), generators, cameras, points), stratum
 
 
-def separate_rotations(trials: TrialData) -> SeenChain:
+def separate_rotations(trials: TrialData) -> ObservedChain:
     """Head from two rotations estimated separately (4.42), as in the thesis: cameras by their epipolar geometry,
     each generator linear, then of maximum likelihood with free points.
 
@@ -279,7 +279,7 @@ def separate_rotations(trials: TrialData) -> SeenChain:
         fit = bundle_rotation(cameras, pixels.swapaxes(0, 1), structure, start, angles, sigmas.swapaxes(0, 1))
         generators.append(fit.generator)
     chain = ProjectiveChain(("revolute", "revolute"), np.array(generators), zero, tip_first=True)
-    return SeenChain(chain, cameras, pinhole_lenses(len(cameras)), ("pan", "tilt"))
+    return ObservedChain(chain, cameras, pinhole_lenses(len(cameras)), ("pan", "tilt"))
 
 
 # -- with rendered images -------------------------------------------------------------------------------------
@@ -428,7 +428,7 @@ def step_pairs(used: tuple[int, ...], steps: int) -> list[tuple[int, int]]:
 
 
 def step_errors(
-    seen: SeenChain,
+    seen: ObservedChain,
     positions: FloatArray,
     pixels: FloatArray,
     target: FloatArray,
@@ -471,7 +471,7 @@ def errors_of(seen: SeenHead, calibrating: int) -> dict[str, dict[str, FloatArra
     heads = {
         "calibrated": calibrated(trials).seen,
         "separate": separate_rotations(trials),
-        "perfect": seen_chain(exact_model(seen.cell)),
+        "perfect": observed_chain(exact_model(seen.cell)),
     }
     answer: dict[str, dict[str, FloatArray]] = {}
     for condition, (positions, pixels, exact, pairs) in _sequences(seen).items():
@@ -533,12 +533,12 @@ def _sequences(seen: SeenHead) -> dict[str, Sequence]:
 
 
 def feed_forward(
-    seen: SeenChain, q_from: FloatArray, pixels: FloatArray, q_to: FloatArray, sigma: FloatArray | float = 1.0
+    seen: ObservedChain, q_from: FloatArray, pixels: FloatArray, q_to: FloatArray, sigma: FloatArray | float = 1.0
 ) -> FloatArray:
     """Predicted raw pixels (s, c, m, 2) at configurations ``q_to`` (s, n) of points seen at ``pixels`` (c, m, 2) in
     ``q_from`` (n,): reconstructed, displaced by the joints (4.44), projected. NaN if two cameras do not see a point.
     """
-    points, _ = points_seen(seen, q_from, pixels, sigma)
+    points, _ = reconstruct_points(seen, q_from, pixels, sigma)
     return predicted_pixels(seen, np.atleast_2d(q_to), points)
 
 

@@ -136,8 +136,8 @@ def held_out_ratio(case: RandomCase, trials: TrialData, result: CalibrationFit) 
     exact = case.cell.pixels(positions)[:, :, kept][seen]
     data = Measurements(order - result.model.zero, camera, stop, marker, exact, np.ones(len(exact)))
     errors = residuals(solution.rig, data)
-    roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ solution.determined.root
-    moments = roots.T @ roots * max(1.0, solution.determined.variance)
+    roots = jacobian(solution.rig, solution.charts, np.zeros(solution.charts.size), data) @ solution.statistics.root
+    moments = roots.T @ roots * max(1.0, solution.statistics.variance)
     mean = float(np.trace(moments))
     freedom = mean**2 / float((moments**2).sum())
     return float(errors @ errors) / mean, freedom, float(np.sqrt((errors**2).mean()))

@@ -21,9 +21,9 @@ from stereoservo.calibration.single_joint_fit import measurements
 from stereoservo.calibration.trial_data import TrialData
 from stereoservo.geometry.cameras import projection_jacobian_many, triangulate
 from stereoservo.geometry.distortion import undistort
-from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, framed, joint_axes
+from stereoservo.kinematics.axes import FramedModel, axis_angle, camera_intrinsics, framed_model, joint_axes
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.covariance import propagate_covariance
 from stereoservo.kinematics.denavit_hartenberg import conventions, dh_values
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.known_length import KnownLength
@@ -182,7 +182,7 @@ QUANTITIES = (
 
 def tables(model: CellModel) -> FloatArray:
     """Tables 5.2 to 5.4 (21,) of a metric ``model`` of the robot: see ``QUANTITIES``."""
-    return tables_of(framed(model), model)
+    return tables_of(framed_model(model), model)
 
 
 def tables_of(parts: FramedModel, names: CellModel) -> FloatArray:
@@ -202,7 +202,7 @@ def tables_of(parts: FramedModel, names: CellModel) -> FloatArray:
 def cramer_rao(cell: SyntheticCell, trials: TrialData) -> FloatArray:
     """Least covariance (21, 21) of `tables` from ``trials``: information of the pixels at the truth, metric bundle."""
     exact = exact_model(cell)
-    parts = framed(exact)
+    parts = framed_model(exact)
     rig = RigModel(cell.kinds, parts.generators, parts.cameras, parts.points, parts.lenses)
     data = measurements(trials, trials.visible, trials.positions - cell.home)
     charts = full_charts(rig, "metric")
@@ -240,7 +240,7 @@ def image_errors(model: CellModel, trials: TrialData, home: FloatArray, home_pix
     Fixed points are triangulated from one stereo image, ``home_pixels`` (c, m, 2) taken at ``home`` (n,), with the
     model's cameras; then the generators are fitted to the trials with fixed points and cameras.
     """
-    parts = framed(model)
+    parts = framed_model(model)
     chain = ProjectiveChain(parts.kinds, parts.generators, parts.zero)
     operators, ahead = chain.operators_at(home), chain.displacement(home)
     rig = _rig(parts, operators, parts.points @ ahead.T)
@@ -347,7 +347,7 @@ def simulate(
         model = fit_model(trials, epoch=1).model
         home_pixels = cell.pixels(cell.home[None])[:, 0]
         home_pixels = home_pixels + rng.normal(0.0, sigma, home_pixels.shape)
-        found, covariance = propagated(model, tables)
+        found, covariance = propagate_covariance(model, tables)
         values.append(found)
         reported.append(np.sqrt(np.diag(covariance)))
         images.append(image_errors(model, trials, cell.home, home_pixels))

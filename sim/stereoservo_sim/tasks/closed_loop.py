@@ -782,7 +782,7 @@ def plan_task_path(
         camera_centres=scene.camera_centres,
         points=scene.points,
         targets=task.target_points,
-        kept=np.ones(len(scene.points)),
+        must_stay_visible=np.ones(len(scene.points)),
         centre=task.centre,
         centre_target=task.centre_target,
         faces=FACE[None],
@@ -807,6 +807,6 @@ def describe_failure(failure: ClosestApproach) -> str:
     """A failure as text."""
     marker = f" of marker {failure.marker}" if failure.marker >= 0 else ""
     return (
-        f"{failure.what} {failure.index}{marker} at {failure.share:.0%} of the way: {failure.value:.4g} "
+        f"{failure.kind} {failure.index}{marker} at {failure.path_parameter:.0%} of the path: {failure.value:.4g} "
         f"{failure.unit}, limit {failure.limit:.4g}"
     )

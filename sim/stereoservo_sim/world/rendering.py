@@ -364,12 +364,12 @@ class BentImage:
         if not camera.sees_whole_image:
             raise ValueError(f"camera {camera.name!r}: k1 = {camera.k1:g} leaves the image's corners dark")
         self.camera = camera
-        self.bends = camera.k1 != 0.0
+        self.has_distortion = camera.k1 != 0.0
         self.origin = np.zeros(2)
         self.pinhole = camera
         self._source: ImageArray | None = None
         self._bent: ImageArray | None = None
-        if not self.bends:
+        if not self.has_distortion:
             return
         v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
         ideal = undistort(camera.lens, np.stack([u, v], axis=-1))
@@ -382,7 +382,7 @@ class BentImage:
 
     def image(self, source: ImageArray) -> ImageArray:
         """Distort the pinhole's image; the last result is cached."""
-        if not self.bends:
+        if not self.has_distortion:
             return source
         if self._bent is None or source is not self._source:
             bent = cv2.remap(source, *self._map, interpolation=cv2.INTER_LINEAR)
@@ -391,7 +391,7 @@ class BentImage:
 
     def outline(self, corners: FloatArray) -> FloatArray:
         """Distort a polygon (k, 2) of the pinhole's image."""
-        return bend_outline(self.camera, corners + self.origin) if self.bends else corners
+        return bend_outline(self.camera, corners + self.origin) if self.has_distortion else corners
 
 
 # -- the backdrop --------------------------------------------------------------------------------------------

@@ -198,7 +198,7 @@ def test_files_of_the_projects_themselves_are_read(tmp_path: Path) -> None:
         (("cam0:", "eye0:"), "camera_matrix"),
     ],
 )
-def test_what_cannot_be_read_is_told(change: tuple[str, str], said: str, tmp_path: Path) -> None:
+def test_what_cannot_be_read_is_reported(change: tuple[str, str], said: str, tmp_path: Path) -> None:
     (tmp_path / "chain.yaml").write_text(KALIBR.replace(*change))
     with pytest.raises(CalibrationError, match=said):
         load_cameras(tmp_path / "chain.yaml")

@@ -292,7 +292,7 @@ def test_real_pairs_as_opencv_has_them(tmp_path: Path, capsys: pytest.CaptureFix
         ([], "CELL is needed"),
     ],
 )
-def test_what_is_missing_is_told(
+def test_what_is_missing_is_reported(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], said: str
 ) -> None:
     (tmp_path / "empty").mkdir()

@@ -12,7 +12,7 @@ from stereoservo.calibration.change.model_changes import start_state
 from stereoservo.calibration.examination.change_points import CLEAR, moved_camera, step_of_camera
 from stereoservo.calibration.examination.examination import examine_views
 from stereoservo.calibration.examination.recorded_views import examined_frames, gaps, single_joint_motions
-from stereoservo.calibration.examination.reference_model import course, frame_noise, learn_reference
+from stereoservo.calibration.examination.reference_model import estimate_offsets, frame_noise, learn_reference
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.joint_accuracy import JointAccuracy
 from stereoservo_sim.experiments.examined_recordings import (
@@ -44,7 +44,7 @@ rest, which says nothing of stamps.
         pytest.param(DRIFTED_IN_TRIALS, ["joint_zero", "dropped_frames"], marks=pytest.mark.slow),
     ],
 )
-def test_what_was_done_is_told_and_nothing_else(seed: int, kinds: list[str]) -> None:
+def test_what_was_done_is_reported_and_nothing_else(seed: int, kinds: list[str]) -> None:
     verdict = judged_examination(seed)
     assert list(verdict.found) == kinds == list(verdict.true)
     assert verdict.falsely == ()
@@ -53,7 +53,7 @@ def test_what_was_done_is_told_and_nothing_else(seed: int, kinds: list[str]) -> 
 
 
 @pytest.mark.slow
-def test_generated_recordings_are_told_apart() -> None:
+def test_generated_recordings_are_distinguished() -> None:
     """Of 30 recordings; the page has the counts of more."""
     answer = run_examined_recordings(seeds=30, seed=1000)
     rows = {row["goals"]: row for row in answer["rows"]}
@@ -63,7 +63,7 @@ def test_generated_recordings_are_told_apart() -> None:
     assert rows["recordings with a false cause"]["count"] <= 3
 
 
-def test_a_recording_without_single_joint_motions_says_which_joints_lack_them() -> None:
+def test_a_recording_without_single_joint_motions_states_which_joints_lack_them() -> None:
     views = examined_case(QUIET).views
     work = views.select(views.times > views.times[-1] - 10.0)
     with pytest.raises(CalibrationError, match="j1, j2, j3, j4, j5, j6 never moves alone") as caught:
@@ -123,7 +123,7 @@ def test_dropped_frames_are_counted_by_numbers_and_by_stamps() -> None:
     assert gaps(irregular, 0) is None
 
 
-def test_a_camera_that_moves_while_the_arm_is_learnt_is_told_to_the_frame() -> None:
+def test_a_camera_that_moves_while_the_arm_is_learnt_is_reported_to_the_frame() -> None:
     """A shift of 0.5 px, and of one marker, found by the pixels of that camera alone; late stamps are none."""
     rng = np.random.default_rng(5)
     views = examined_case(QUIET).views
@@ -155,7 +155,7 @@ def test_a_camera_that_moves_while_the_arm_is_learnt_is_told_to_the_frame() -> N
     assert moved_camera(late) is None
 
 
-def test_what_else_happened_is_told_beside_a_camera_that_moved_while_the_arm_is_learnt() -> None:
+def test_what_else_happened_is_reported_beside_a_camera_that_moved_while_the_arm_is_learnt() -> None:
     """Of a bump during the trial motions its size, and the other camera's stamps, late from later on."""
     views = examined_case(REFUSED_OTHERWISE).views
     f = len(views.camera)
@@ -183,17 +183,19 @@ def test_of_a_body_that_moves_by_itself_stamps_are_not_examined() -> None:
     assert all(camera.offset_s is None for camera in report.cameras.values())
 
 
-def test_stamps_are_told_against_poses_before_any_camera_is_known() -> None:
+def test_stamps_are_reported_against_poses_before_any_camera_is_known() -> None:
     """Offsets against those of the generated recording, of either half, and of a recording without any."""
     late, plain = examined_case(LATE_POSES), examined_case(POSES).views
     size = late.faults[0].size
     f = len(late.views.camera)
     for frames in (np.arange(f), np.arange(f // 2), np.arange(f // 2, f)):
-        assert course(late.views, frames).offsets == pytest.approx([0.0, size], abs=2e-3)
+        assert estimate_offsets(late.views, frames).offsets == pytest.approx([0.0, size], abs=2e-3)
     half = np.arange(len(plain.camera) // 2)
     moved = plain.shifted(np.where(plain.camera == 0, -0.04, 0.0))
     assert moved.stamped[moved.camera == 0] == pytest.approx(plain.times[plain.camera == 0])
-    assert course(moved, half).offsets[0] - course(plain, half).offsets[0] == pytest.approx(0.04, abs=2e-3)
+    assert estimate_offsets(moved, half).offsets[0] - estimate_offsets(plain, half).offsets[0] == pytest.approx(
+        0.04, abs=2e-3
+    )
 
 
 def test_the_noise_of_frames_is_that_of_the_pixels_where_the_motion_is_even() -> None:

@@ -196,7 +196,7 @@ def test_a_stretched_elbow_is_no_continuum_and_the_judge_takes_none_for_it(puma)
     assert not kept_along(puma, found, goal, None)
 
 
-def test_out_of_reach_says_which_joint_and_by_how_much():
+def test_out_of_reach_states_which_joint_and_by_how_much():
     """Two links of 0.4 and 0.3 m, asked to 1.4 m: ``cosθ₂ = (1.4² - 0.25) / 0.24 = 7.125``."""
     axes = families.joined(from_rows(((0.4, 0, 0),)), from_rows(((0.3, 0, 0),)))
     axes.points[1, 0] = 0.4

@@ -12,8 +12,8 @@ from stereoservo.kinematics.joint_angles import measured_joints, refined_joints
 from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
     joint_problem,
+    observed_chain,
     predicted_pixels,
-    seen_chain,
 )
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
@@ -24,7 +24,7 @@ SIGMA = 0.2
 @pytest.mark.parametrize("seed", range(4))
 def test_every_posture_shows_the_images_and_the_true_one_is_among_them(seed):
     model = exact_model(synthetic.rx90())
-    seen = seen_chain(model)
+    seen = observed_chain(model)
     rng = np.random.default_rng(seed)
     q = seen.chain.zero + rng.uniform(-0.2, 0.2, 6)
     exact = predicted_pixels(seen, q[None], model.marker_points)[0]
@@ -51,7 +51,7 @@ def test_every_posture_shows_the_images_and_the_true_one_is_among_them(seed):
 
 def test_images_that_do_not_tell_a_posture_are_refused_with_the_number():
     model = exact_model(synthetic.rx90())
-    seen = seen_chain(model)
+    seen = observed_chain(model)
     pixels = predicted_pixels(seen, seen.chain.zero[None], model.marker_points)[0]
     pixels[1, 2:] = np.nan
     with pytest.raises(InverseKinematicsError, match=r"2 markers are shown to two cameras; 3 are needed"):
@@ -73,7 +73,7 @@ def test_a_learnt_arm_of_four_joints_has_both_its_elbows():
 
 def test_starts_that_are_refined_together_end_as_each_by_itself():
     cell, rng = synthetic.rx90(), np.random.default_rng(1)
-    seen = seen_chain(exact_model(cell))
+    seen = observed_chain(exact_model(cell))
     q = cell.held_out(rng, 1, 0.5)[0]
     pixels = cell.pixels(q[None])[:, 0] + rng.normal(0, SIGMA, (2, len(cell.body), 2))
     problem = joint_problem(seen, exact_model(cell).marker_points, pixels, SIGMA)

@@ -7,7 +7,7 @@ import pytest
 from scipy.stats import chi2
 
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.kinematics.inverse.recognition import chain_of, examined, recognise, structure
+from stereoservo.kinematics.inverse.recognition import chain_of, check_condition, recognise, structure
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo_sim.experiments import inverse_kinematics as families
 from stereoservo_sim.experiments.inverse_kinematics import hide
@@ -96,7 +96,7 @@ def test_calibrated_arm_is_recognised_within_its_covariance(calibrated):
         assert evidence.chi2 <= evidence.threshold
 
 
-def test_the_structure_of_a_learnt_arm_is_told_and_nothing_else(calibrated):
+def test_the_structure_of_a_learnt_arm_is_reported_and_nothing_else(calibrated):
     """Of an elbow arm with a spherical wrist: the first axis meets the second, the upper arm turns in one plane."""
     for arm in (calibrated("rx90", 0), chain_of(exact_model(synthetic.rx90()))):
         told = structure(arm)
@@ -112,8 +112,8 @@ def test_chi_square_of_conditions_that_hold_is_chi_square(calibrated):
     total = 0.0
     for seed in range(2):
         model = calibrated("rx90", seed)
-        total += examined(model, "parallel", (1, 2)).chi2
-        total += examined(model, "common_point", (3, 4, 5)).chi2
+        total += check_condition(model, "parallel", (1, 2)).chi2
+        total += check_condition(model, "common_point", (3, 4, 5)).chi2
     low, high = chi2.ppf([5e-4, 1 - 5e-4], 2 * (2 + 3))
     assert low < total < high
 
@@ -126,9 +126,9 @@ def test_chi_square_of_conditions_that_hold_is_chi_square(calibrated):
         ((4, ("shift", 0.003)), "common_point", (4, 5)),
     ],
 )
-def test_a_third_of_a_degree_and_three_millimetres_are_told_from_none(calibrated, change, condition, joints):
+def test_a_third_of_a_degree_and_three_millimetres_are_distinguished_from_none(calibrated, change, condition, joints):
     model = calibrated("rx90", 0, change)
-    evidence = examined(model, condition, joints)
+    evidence = check_condition(model, condition, joints)
     assert not evidence.holds
     assert evidence.chi2 > 3 * evidence.threshold
     assert recognise(model).case == "numerical"

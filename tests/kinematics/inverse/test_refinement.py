@@ -8,7 +8,7 @@ from stereoservo.geometry.cameras import triangulate
 from stereoservo.kinematics.inverse.postures import refined_on_images
 from stereoservo.kinematics.inverse.recognition import recognise
 from stereoservo.kinematics.inverse.solver import inverse_kinematics
-from stereoservo.kinematics.joint_reprojection import JointAnglesError, predicted_pixels, seen_chain
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, observed_chain, predicted_pixels
 from stereoservo_sim.world import synthetic
 from stereoservo_sim.world.exact_model import exact_model
 
@@ -18,7 +18,7 @@ SIGMA = 0.2
 @pytest.fixture(scope="module")
 def cell():
     model = exact_model(synthetic.rx90())
-    return model, seen_chain(model), recognise(model)
+    return model, observed_chain(model), recognise(model)
 
 
 def measured(cell, seed):

@@ -52,7 +52,7 @@ def test_circle_meets_plane_in_both_roots(seed, theta):
     assert near(crossing.angles, theta, 1e-6)
 
 
-def test_circle_short_of_a_plane_comes_nearest_and_says_by_how_much():
+def test_circle_short_of_a_plane_comes_nearest_and_states_by_how_much():
     """A unit circle about z and the plane x = 3: nearest at angle 0, three radii are two too many."""
     G = np.zeros((4, 4))
     G[0, 1], G[1, 0] = -1.0, 1.0
@@ -130,7 +130,7 @@ def test_prismatic_joints_need_no_heights(count):
     assert prismatic_joints(arm_.chain.generators, A[None], target[None]).steps[0] == pytest.approx(tau)
 
 
-def test_prismatic_joints_in_one_direction_share_the_way_and_are_free():
+def test_prismatic_joints_in_one_direction_share_the_path_and_are_free():
     arm_, rng = drawn(families.sliding(2), 4)
     G = arm_.chain.generators
     G = np.array([G[0], 2.0 * G[0], G[1]])

@@ -8,7 +8,7 @@ import pytest
 
 from oracles.thesis_verdicts import KNOWN, changed
 from stereoservo.cli import main as cli
-from stereoservo.kinematics.axes import framed
+from stereoservo.kinematics.axes import framed_model
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS
 from stereoservo_sim.experiments.robot import (
     IMPLIED_BASELINE,
@@ -64,7 +64,7 @@ def test_tables_of_the_exact_model_are_those_of_the_arm():
 
 def test_tables_do_not_depend_on_the_scale():
     exact = exact_model(thesis_cell())
-    parts = framed(exact)
+    parts = framed_model(exact)
     scale = np.diag([3.0, 3.0, 3.0, 1.0])
     larger = replace(
         parts,

@@ -240,8 +240,8 @@ def _rectified(cameras: Sequence[RigCamera]) -> list[tuple[FloatArray, FloatArra
     baseline = -R.T @ t
     x = baseline / np.linalg.norm(baseline)
     x = x if x[0] >= 0 else -x
-    middle = np.array([0.0, 0.0, 1.0]) + R[2]
-    y = np.cross(middle, x)
+    mean_axis = np.array([0.0, 0.0, 1.0]) + R[2]
+    y = np.cross(mean_axis, x)
     y /= np.linalg.norm(y)
     left = np.array([x, y, np.cross(x, y)])
     right = left @ R.T

@@ -41,7 +41,7 @@ from stereoservo.calibration.rig_model import (
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.geometry.cameras import pixel_normaliser
 from stereoservo.geometry.displacements import similarity_from_points
-from stereoservo.geometry.distortion import lens_from_lines, straight_lens, undistort
+from stereoservo.geometry.distortion import lens_from_lines, pinhole_lens, undistort
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.geometry.homography import homography_from_points, plane_homography
 from stereoservo.geometry.screws import twist_matrix
@@ -113,11 +113,11 @@ def _pinhole(focal: float, centre: FloatArray) -> FloatArray:
 
 def _in_plane(layout: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Motion (4, 4) of the layout into its plane z = 0, and its coordinates (m, 2) there."""
-    middle = layout.mean(axis=0)
-    rows = np.linalg.svd(layout - middle)[2]
+    centroid = layout.mean(axis=0)
+    rows = np.linalg.svd(layout - centroid)[2]
     rows[2] *= np.linalg.det(rows)
-    frame = rigid(rows, -rows @ middle)
-    return frame, (layout - middle) @ rows[:2].T
+    frame = rigid(rows, -rows @ centroid)
+    return frame, (layout - centroid) @ rows[:2].T
 
 
 def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -> FloatArray:
@@ -127,10 +127,10 @@ def plane_homographies(views: RigViews, lenses: FloatArray, plane: FloatArray) -
     for k in range(c):
         ideal = undistort(lenses[k], views.pixels[k])
         for stop in range(s):
-            there = np.isfinite(ideal[stop]).all(axis=1)
-            if int(there.sum()) >= 4:
+            visible = np.isfinite(ideal[stop]).all(axis=1)
+            if int(visible.sum()) >= 4:
                 try:
-                    found[k, stop] = plane_homography(plane[there], ideal[stop, there])
+                    found[k, stop] = plane_homography(plane[visible], ideal[stop, visible])
                 except GeometryError:
                     continue  # the markers seen in this image are on one line: no homography
     return found
@@ -141,19 +141,19 @@ def _line_lens(views: RigViews, k: int) -> FloatArray:
     camera, lines = views.cameras[k], []
     for members in _layout_lines(views.layout):
         for raw in views.pixels[k][:, members]:
-            there = raw[np.isfinite(raw).all(axis=1)]
-            if len(there) >= LINE_MARKERS:
-                lines.append(there)
+            visible = raw[np.isfinite(raw).all(axis=1)]
+            if len(visible) >= LINE_MARKERS:
+                lines.append(visible)
     lines = lines[:: max(1, len(lines) // LINES)]
     if lines:
         sigma = float(np.median(views.sigmas[k][views.seen[k]]))
         try:
             found = lens_from_lines(lines, sigma, camera.width, camera.height).lens
             # Lines hardly determine the centre of a weak distortion, and the principal point is tied to it.
-            return np.append(found[0], straight_lens(camera.width, camera.height)[1:])
+            return np.append(found[0], pinhole_lens(camera.width, camera.height)[1:])
         except GeometryError:
             pass  # the bundle converges from a lens without distortion, too
-    return straight_lens(camera.width, camera.height)
+    return pinhole_lens(camera.width, camera.height)
 
 
 def _layout_lines(layout: FloatArray | None) -> list[list[int]]:
@@ -203,11 +203,11 @@ def _plane_pose(H: FloatArray, focal: float, centre: FloatArray) -> FloatArray:
 def _extrinsics(poses: FloatArray) -> FloatArray:
     """Motions (c, 4, 4) from the first camera's frame into each, along the pairs with most common places."""
     c = len(poses)
-    there = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
+    known = np.asarray(np.isfinite(poses).all(axis=(2, 3)))
     found = np.full((c, 4, 4), np.nan)
     found[0], done = np.eye(4), {0}
     while len(done) < c:
-        common = [(int((there[j] & there[k]).sum()), j, k) for j in done for k in range(c) if k not in done]
+        common = [(int((known[j] & known[k]).sum()), j, k) for j in done for k in range(c) if k not in done]
         count, j, k = max(common)
         if not count:
             raise refused(
@@ -218,11 +218,11 @@ def _extrinsics(poses: FloatArray) -> FloatArray:
                 " places",
                 "Hold it where two cameras at a time see it",
             )
-        both = np.flatnonzero(there[j] & there[k])
+        both = np.flatnonzero(known[j] & known[k])
         motions = np.array([poses[k, i] @ np.linalg.inv(poses[j, i]) for i in both])
         turns = Rotation.from_matrix(motions[:, :3, :3])
-        apart = [np.median((turns * turns[i].inv()).magnitude()) for i in range(len(both))]
-        found[k] = motions[int(np.argmin(apart))] @ found[j]
+        deviations = [np.median((turns * turns[i].inv()).magnitude()) for i in range(len(both))]
+        found[k] = motions[int(np.argmin(deviations))] @ found[j]
         done.add(k)
     return found
 
@@ -238,7 +238,7 @@ def _starts_of_body(views: RigViews) -> list[RigStart]:
     found, failure = [], None
     for lenses in (
         epipolar_lenses(trials),
-        np.array([straight_lens(c.width, c.height) for c in views.cameras]),
+        np.array([pinhole_lens(c.width, c.height) for c in views.cameras]),
     ):
         try:
             found += _starts_through(views, trials, lenses)
@@ -254,11 +254,11 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
     them does not converge, one without distortion may.
     """
     cameras, points, _ = initial_reconstruction(undistorted(trials, lenses))
-    there = np.asarray(np.isfinite(points).all(axis=2))
-    reference = int(np.argmax((there[:, None] & there[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
+    known = np.asarray(np.isfinite(points).all(axis=2))
+    reference = int(np.argmax((known[:, None] & known[None]).sum(axis=2).clip(0, 8).sum(axis=1)))
     motions = _displacements(points, reference)
     plane, _, _ = planes_at_infinity(motions - np.eye(4), np.ones(len(motions)))
-    everywhere = points[there]
+    everywhere = points[known]
     scaled = scaled_plane(plane, everywhere)
     if scaled is None:
         scaled = scaled_plane(np.array([0.0, 0.0, 0.0, 1.0]), everywhere)
@@ -273,8 +273,8 @@ def _starts_through(views: RigViews, trials: TrialData, lenses: FloatArray) -> l
         )
     A = projective_to_euclidean(scaled, np.eye(3))
     affine = A @ motions @ np.linalg.inv(A)
-    turning = 0.5 * (affine - np.linalg.inv(affine))
-    linear, _ = intrinsics_linear(turning, np.ones(len(turning), dtype=bool), np.ones(len(turning)))
+    rotations = 0.5 * (affine - np.linalg.inv(affine))
+    linear, _ = intrinsics_linear(rotations, np.ones(len(rotations), dtype=bool), np.ones(len(rotations)))
     focals = [] if linear is None else [float(np.sqrt(linear[0, 0] * linear[1, 1]))]
     focals = [f for f in focals if FOCAL_RANGE[0] <= f <= FOCAL_RANGE[1]] + list(NOMINAL_FOCALS)
     return [_metric_start(views, cameras, points, reference, scaled, nominal_intrinsics(f), lenses) for f in focals]
@@ -285,9 +285,9 @@ def _displacements(points: FloatArray, reference: int) -> FloatArray:
 
     Raises CalibrationError (``flat_body``, ``too_few_markers``).
     """
-    there, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
+    known, found, flat = np.asarray(np.isfinite(points).all(axis=2)), [], 0
     for stop in range(len(points)):
-        common = there[stop] & there[reference]
+        common = known[stop] & known[reference]
         if stop == reference or int(common.sum()) < 6:
             continue
         try:
@@ -435,9 +435,9 @@ class RigFit(RigProblem):
     @cached_property
     def root(self) -> FloatArray:
         """``R⁻¹`` (p, p), with ``R⁻¹ R⁻ᵀ`` the covariance of the parameters at the variance of the residuals."""
-        return np.asarray(self.solution.determined.root * np.sqrt(self.variance))
+        return np.asarray(self.solution.statistics.root * np.sqrt(self.variance))
 
-    def moved(self, x: FloatArray) -> RigModel:
+    def retract(self, x: FloatArray) -> RigModel:
         """The model at chart coordinates ``x`` (p,)."""
         return rig_at(self.rig, self.solution.charts, x)
 
@@ -463,22 +463,22 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
     rig = _rig(start, body_frame)
     known = start.reference is None
     if known:
-        data = _with_poses_settled(rig, data)
+        data = _with_refined_poses(rig, data)
     begun = RigProblem(views, data, np.ones(len(data.camera), dtype=bool), body_frame, 1.0, known)
     if not known:
         ties = PinholeTies(LOOSE, LOOSE, LOOSE)
-        loose = _settled(begun, rig, lenses, ties)
+        loose = _converged(begun, rig, lenses, ties)
         if not loose.solution.converged:  # its first step is too large for the initial places
-            begun = replace(begun, data=_with_poses_settled(rig, data))
-            loose = _settled(begun, rig, lenses, ties)
+            begun = replace(begun, data=_with_refined_poses(rig, data))
+            loose = _converged(begun, rig, lenses, ties)
         if not loose.solution.converged:
             return loose
         begun, rig = loose, loose.rig
-    square = _settled(begun, rig, lenses, PinholeTies(TIED, TIED, TIED))
+    square = _converged(begun, rig, lenses, PinholeTies(TIED, TIED, TIED))
     if not square.solution.converged:
         return square
     open_aspect = PinholeTies(TIED, np.inf, TIED)
-    free = _settled(square, square.rig, lenses, open_aspect)
+    free = _converged(square, square.rig, lenses, open_aspect)
     if not free.solution.converged:
         return free
     # Pixels are square unless the chi-square of all cameras' aspects is far beyond chance.
@@ -487,7 +487,7 @@ def fit_rig(views: RigViews, start: RigStart, lenses: LensModel = "brown") -> Ri
         return square
     for _ in range(ASPECT_ROUNDS):
         ratio = np.mean([np.divide(*np.diag(decompose_camera(P)[0])[:2]) for P in free.rig.cameras])
-        free = _settled(*_stretched(free, float(ratio)), lenses, open_aspect)
+        free = _converged(*_stretched(free, float(ratio)), lenses, open_aspect)
         if not free.solution.converged:
             break
     return free
@@ -511,7 +511,7 @@ def _placed(views: RigViews, start: RigStart) -> tuple[RigViews, RigStart]:
     )
 
 
-def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
+def _converged(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeTies) -> RigFit:
     """The bundle from ``rig``, starting with the places and the kept measurements of ``begun``."""
     data, kept = replace(begun.data, pinhole_ties=ties), begun.kept
     for _ in range(ROUNDS):
@@ -536,18 +536,18 @@ def _settled(begun: RigProblem, rig: RigModel, lenses: LensModel, ties: PinholeT
     return fit
 
 
-def _with_poses_settled(rig: RigModel, data: Measurements) -> Measurements:
+def _with_refined_poses(rig: RigModel, data: Measurements) -> Measurements:
     """The measurements with the hand's readings fitted to each stop separately, with cameras and body fixed, because
     the bundle does not damp the hand's errors.
     """
     offsets = data.offsets.copy()
     for stop in np.unique(data.stop):
         mine = data.select(data.stop == stop)
-        offsets[stop] = _settled_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
+        offsets[stop] = _refined_pose(rig, replace(mine, stop=np.zeros_like(mine.stop)), offsets[stop])
     return replace(data, offsets=offsets)
 
 
-def _settled_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
+def _refined_pose(rig: RigModel, data: Measurements, reading: FloatArray) -> FloatArray:
     fit = DenseFit[FloatArray](
         lambda q: residuals(rig, replace(data, offsets=q[None]))[:, None],
         lambda q: joint_columns(rig, replace(data, offsets=q[None]))[:, None],

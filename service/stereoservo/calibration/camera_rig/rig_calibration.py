@@ -23,7 +23,7 @@ from stereoservo.calibration.normal_equations import by_stop
 from stereoservo.calibration.rig_model import Measurements, RigModel, predicted
 from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.geometry.homogeneous import GeometryError
-from stereoservo.geometry.strata import decompose_camera, intrinsics_and_slopes
+from stereoservo.geometry.strata import decompose_camera, intrinsics_and_jacobian
 from stereoservo.numerics.arrays import FloatArray
 
 SCHEMA = 1
@@ -193,19 +193,19 @@ def _require_turns(poses: FloatArray, deviations: FloatArray, views: RigViews) -
     A plane's normal is ``Kᵀ l`` of its vanishing line, so that parallel boards have one normal for any assumed camera;
     and turns of an unknown body are those of its projective displacements' eigenvalues.
     """
-    there = np.isfinite(poses[:, 0, 0])
+    known = np.isfinite(poses[:, 0, 0])
     if views.layout is not None:
         normal = np.linalg.svd(views.layout - views.layout.mean(axis=0))[2][2]
-        directions = poses[there, :3, :3] @ normal
+        directions = poses[known, :3, :3] @ normal
         mean = np.linalg.svd(directions)[2][0]
         angles = np.degrees(np.arccos(np.clip(np.abs(directions @ mean), 0.0, 1.0)))
         cause, what = "flat_motion", "the board stayed parallel to itself: tilt about the mean"
     else:
-        turns = Rotation.from_matrix(poses[there, :3, :3])
+        turns = Rotation.from_matrix(poses[known, :3, :3])
         angles = np.degrees((turns.mean().inv() * turns).magnitude())
         cause, what = "no_turns", "the body was hardly turned: turn about the mean"
     reached = float(np.quantile(angles, 0.9))
-    limit = max(LEAST_TURN, TURN_SIGMAS * float(np.median(deviations[there])))
+    limit = max(LEAST_TURN, TURN_SIGMAS * float(np.median(deviations[known])))
     if not reached >= limit:
         raise refused(cause, what, reached, limit, "°", WAVE)
 
@@ -306,9 +306,9 @@ def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
     here = _physical(fit.rig, fit.aspect, known, ids, metric)
 
     def vector(x: FloatArray) -> FloatArray:
-        there = _physical(fit.moved(x), fit.aspect, known, ids, metric)
-        turns = Rotation.from_matrix(there.rotations @ here.rotations.transpose(0, 2, 1)).as_rotvec()
-        return np.concatenate([there.intrinsics.ravel(), np.hstack([turns, there.translations])[1:].ravel()])
+        changed = _physical(fit.retract(x), fit.aspect, known, ids, metric)
+        turns = Rotation.from_matrix(changed.rotations @ here.rotations.transpose(0, 2, 1)).as_rotvec()
+        return np.concatenate([changed.intrinsics.ravel(), np.hstack([turns, changed.translations])[1:].ravel()])
 
     root = fit.root
     slopes = np.zeros((len(vector(np.zeros(len(root)))), len(root)))
@@ -416,7 +416,7 @@ def next_views(fit: RigFit, result: RigCalibration) -> list[ViewAdvice]:
     """
     worst = max(result.cameras, key=lambda camera: camera.deviations["fx"] / camera.focal[0])
     k = [camera.name for camera in result.cameras].index(worst.name)
-    known, scale = fit.solution.determined.triangle, float(np.sqrt(fit.variance))
+    known, scale = fit.solution.statistics.triangle, float(np.sqrt(fit.variance))
     row = _focal_slope(fit, k)
     now = scale * deviation_of(known, row)
     found = []
@@ -444,7 +444,7 @@ def _focal_slope(fit: RigFit, k: int) -> FloatArray:
     charts = fit.solution.charts
     row = np.zeros(charts.size)
     at = charts.start(1) + sum(len(basis) for basis in charts.cameras[:k])
-    row[at : at + len(charts.cameras[k])] = intrinsics_and_slopes(fit.rig.cameras[k], charts.cameras[k])[1][0]
+    row[at : at + len(charts.cameras[k])] = intrinsics_and_jacobian(fit.rig.cameras[k], charts.cameras[k])[1][0]
     return row
 
 
@@ -461,7 +461,7 @@ def _rows(
     motions = np.array([np.array(one.motion) for one in result.cameras])
     depths = fit.poses[:, 2, 3]
     depth = share * float(np.median(depths))
-    middle = fit.points.mean(axis=0)
+    centroid = fit.points.mean(axis=0)
     ray = np.array([place[0] * camera.width / camera.focal[0], place[1] * camera.height / camera.focal[1], 1.0])
     turn = Rotation.from_euler("xy", tilt, degrees=True).as_matrix() @ _facing(fit, k)
     scale = float(np.linalg.norm(motions[k][:3, 3]))
@@ -469,7 +469,7 @@ def _rows(
     R = motions[k][:3, :3]
     centre = R.T @ (depth * ray - shift)
     pose_turn = R.T @ turn
-    offsets = np.append(centre - pose_turn @ middle, Rotation.from_matrix(pose_turn @ fit.body_frame).as_euler("XYZ"))
+    offsets = np.append(centre - pose_turn @ centroid, Rotation.from_matrix(pose_turn @ fit.body_frame).as_euler("XYZ"))
     c, m = len(result.cameras), len(fit.points)
     cameras, markers = (grid.ravel() for grid in np.meshgrid(np.arange(c), np.arange(m), indexing="ij"))
     noise = fit.data.joint_noise

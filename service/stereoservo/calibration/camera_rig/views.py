@@ -105,11 +105,11 @@ def _require_stops(views: RigViews) -> None:
     reached = {0}
     for _ in views.cameras:
         reached |= {k for k in range(len(views.cameras)) if any((by_camera[k] & by_camera[j]).any() for j in reached)}
-    apart = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
-    if apart:
+    unlinked = [camera.name for k, camera in enumerate(views.cameras) if k not in reached]
+    if unlinked:
         raise refused(
             "camera_apart",
-            f"camera(s) {', '.join(apart)} never saw the body together with {views.cameras[0].name!r} or a camera "
+            f"camera(s) {', '.join(unlinked)} never saw the body together with {views.cameras[0].name!r} or a camera "
             "that did",
             0,
             1,
@@ -162,7 +162,7 @@ ELSEWHERE_PX = 8.0
 
 
 @dataclass(frozen=True)
-class _Still:
+class _StillInterval:
     """An interval [ns] in which one camera saw the body still, or (``empty``) did not see it."""
 
     began: int
@@ -211,9 +211,9 @@ def still_places(cameras: Sequence[TrialCamera], seen: Mapping[str, Sequence[Cam
     )
 
 
-def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
+def _intervals(observations: Sequence[CameraObservation]) -> list[_StillInterval]:
     """Intervals in which one camera saw the body still, or did not see it."""
-    found: list[_Still] = []
+    found: list[_StillInterval] = []
     for before, after in pairwise(observations):
         if after.t_shutter_ns - before.t_shutter_ns > GAP_S * 1e9:
             continue
@@ -226,9 +226,9 @@ def _intervals(observations: Sequence[CameraObservation]) -> list[_Still]:
                 continue
         last = found[-1] if found else None
         if last is not None and last.ended == before.t_shutter_ns and last.empty == few:
-            found[-1] = _Still(last.began, after.t_shutter_ns, few)
+            found[-1] = _StillInterval(last.began, after.t_shutter_ns, few)
         else:
-            found.append(_Still(before.t_shutter_ns, after.t_shutter_ns, few))
+            found.append(_StillInterval(before.t_shutter_ns, after.t_shutter_ns, few))
     return found
 
 

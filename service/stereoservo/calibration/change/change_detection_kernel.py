@@ -35,7 +35,7 @@ EXPLAINED = 0.05
 """Share of chi-square that may remain beside the noise: models are inexact far from their estimate."""
 
 
-class SightedPoints(NamedTuple):
+class ObservedPoints(NamedTuple):
     """Points ``X`` (p, 4) in cameras ``Ps`` (c, 3, 4): observed or predicted ``pixels`` (c, p, 2), with ``weights``
     (c, p) [1/px], 0 if not seen.
     """
@@ -62,7 +62,7 @@ class Displaced(NamedTuple):
 
 
 @kernel
-def _effect(predicted: SightedPoints, camera: int, D: FloatArray, count: int) -> float:
+def _effect(predicted: ObservedPoints, camera: int, D: FloatArray, count: int) -> float:
     """Rms motion [px] of the first ``count`` points, if seen, in one camera, or all (-1), by a displacement."""
     Ps, X, pixels, weights = predicted
     low, high = (0, Ps.shape[0]) if camera < 0 else (camera, camera + 1)
@@ -90,7 +90,7 @@ def _angle(D: FloatArray) -> float:
     return 2.0 * math.asin(math.sqrt(min(max(quarter, 0.0), 1.0)))
 
 
-class Moment(NamedTuple):
+class Snapshot(NamedTuple):
     """Measurements of one moment: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
     their predicted ``pixels`` and ``observed`` ones (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators``
     (n, 4, 4) and the ``twists`` (6 or 0, 4, 4) of a metric model.
@@ -107,14 +107,14 @@ class Moment(NamedTuple):
 
 
 @kernel
-def fit_hypothesis(h: int, rounds: int, moment: Moment, sizes: IntArray, result: FloatArray) -> None:
+def fit_hypothesis(h: int, rounds: int, moment: Snapshot, sizes: IntArray, result: FloatArray) -> None:
     """Estimate of hypothesis ``h`` into ``result`` (4,): chi-square of the affected measurements, first-order gain,
     amount, effect [px].
     """
     Ps, X, markers, pixels, observed, weights, operators, twists = moment
     cameras, joints = Ps.shape[0], operators.shape[0]
     D, total = np.empty((4, 4)), np.empty(MAX_SIZE)
-    seen_points, predicted = SightedPoints(Ps, X, observed, weights), SightedPoints(Ps, X, pixels, weights)
+    seen_points, predicted = ObservedPoints(Ps, X, observed, weights), ObservedPoints(Ps, X, pixels, weights)
     result[2] = 0.0
     if h <= cameras or h == cameras + 1:
         camera = h - 1 if h <= cameras else -1
@@ -218,7 +218,7 @@ def _kind(h: int, cameras: int, markers: int, joints: int) -> int:
 
 class Innovations(NamedTuple):
     """``innovations`` (c, p, 2) [px] with ``weights`` (c, p) [1/px] of points ``X`` (p, 4), the first ``markers`` on
-    the arm, then static ones, in cameras ``Ps`` (c, 3, 4); ``operators`` and ``twists`` as in `Moment`.
+    the arm, then static ones, in cameras ``Ps`` (c, 3, 4); ``operators`` and ``twists`` as in `Snapshot`.
     """
 
     Ps: FloatArray
@@ -281,7 +281,7 @@ def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, 
     answer[0], answer[1], answer[2] = NOTHING, 0, -1
     chi2[0] = whole
     amounts[0], effects[0] = 0.0, 0.0
-    moment = Moment(Ps, X, markers, pixels, observed, weights, operators, twists)
+    moment = Snapshot(Ps, X, markers, pixels, observed, weights, operators, twists)
     result = np.zeros(4)
     now, gains = np.zeros(count), np.zeros(count)
     any_gain = False
@@ -402,7 +402,7 @@ def _solved(N: FloatArray, b: FloatArray, x: FloatArray) -> float:
 
 @kernel
 def fit_displacement(
-    seen: SightedPoints, camera: int, group: DisplacementGroup, count: int, rounds: int, found: Displaced
+    seen: ObservedPoints, camera: int, group: DisplacementGroup, count: int, rounds: int, found: Displaced
 ) -> tuple[float, float]:
     """Chi-square of the first ``count`` points in one camera, or all (-1), moved by the best element of a group, which
     is written to ``found``.
@@ -525,12 +525,12 @@ def fit_image_motion(
 
 
 @kernel
-def fit_point(sighted: SightedPoints, p: int, rounds: int, found: FloatArray) -> tuple[float, float]:
+def fit_point(observed_points: ObservedPoints, p: int, rounds: int, found: FloatArray) -> tuple[float, float]:
     """Chi-square of point ``p`` alone at its best position ``found`` (4,); second: first-order gain of the first step.
 
     With two or more views, three of its coordinates are free, all but the largest.
     """
-    Ps, X, observed, weights = sighted
+    Ps, X, observed, weights = observed_points
     largest = 0
     for i in range(1, 4):
         if abs(X[p, i]) > abs(X[p, largest]):

@@ -55,7 +55,7 @@ from stereoservo.calibration.change.model_changes import (
 )
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.kinematics.joint_angles import AMBIGUOUS, LARGEST_DEVIATION, joint_zeros
-from stereoservo.kinematics.joint_reprojection import JointAnglesError, seen_chain
+from stereoservo.kinematics.joint_reprojection import JointAnglesError, observed_chain
 from stereoservo.kinematics.model import CellModel, ModelCovariance
 from stereoservo.messages.check_report import CheckReport, Drift, FoundCause, JointReset, Status, ZeroReset
 from stereoservo.numerics.arrays import FloatArray
@@ -166,13 +166,13 @@ def estimate_joint_zeros(
         best = min(ends, key=lambda one: one.chi2)
         noise = max(1.0, best.chi2 / max(1, 2 * len(problem.data.camera) - best.x.size))
         for one in ends:
-            apart = _without_turns(model, one.x - best.x)
-            other = float(apart @ best.information @ apart) > AMBIGUOUS
+            difference = _without_full_turns(model, one.x - best.x)
+            other = float(difference @ best.information @ difference) > AMBIGUOUS
             if other and one.chi2 - best.chi2 < AMBIGUOUS * noise:
                 return None  # two postures that the images do not distinguish
         found = best
-    if (np.abs(found.x - _without_turns(model, found.x)) > np.pi).any():
-        found = estimate_changes(problem, named, start=_without_turns(model, found.x))
+    if (np.abs(found.x - _without_full_turns(model, found.x)) > np.pi).any():
+        found = estimate_changes(problem, named, start=_without_full_turns(model, found.x))
     kept = _best_subset(found, float(_thresholds(problem, hypotheses).ratios[1]))
     return estimate_changes(problem, tuple(named[k] for k in kept), start=found.x[kept]) if kept else None
 
@@ -192,7 +192,7 @@ def _best_subset(found: ChangeEstimate, price: float) -> list[int]:
     return best[1]
 
 
-def _without_turns(model: CellModel, drifts: FloatArray) -> FloatArray:
+def _without_full_turns(model: CellModel, drifts: FloatArray) -> FloatArray:
     """Drifts (n,) without whole turns of revolute joints, which are not observable."""
     revolute = np.array([kind == "revolute" for kind in model.joint_kinds])
     return np.where(revolute, np.mod(drifts + np.pi, 2.0 * np.pi) - np.pi, drifts)
@@ -211,7 +211,7 @@ def _search_zeros(model: CellModel, problem: LinearisedProblem) -> tuple[FloatAr
     encoders = np.empty_like(data.offsets)
     encoders[:, list(problem.order)] = data.offsets
     encoders += model.zero
-    seen = seen_chain(model)
+    seen = observed_chain(model)
     try:
         zeros = joint_zeros(seen, model.marker_points, pixels[stops], sigmas[stops], encoders[stops])
     except JointAnglesError:
@@ -378,7 +378,7 @@ def _found_cause(model: CellModel, problem: LinearisedProblem, found: ChangeEsti
     )  # fmt: skip
 
 
-def _turned(value: float | None, deviation: float | None) -> str:
+def _rotation_text(value: float | None, deviation: float | None) -> str:
     if value is None or deviation is None:
         return ""
     return f" (turned {np.degrees(value):.3g}° ± {np.degrees(deviation):.2g}°, and shifted)"
@@ -395,16 +395,16 @@ def _joint_sentence(model: CellModel, subject: str, value: float | None, deviati
 
 
 SENTENCES: dict[str, Callable[[CellModel, str, float | None, float | None], str]] = {
-    "camera": lambda model, subject, value, deviation: f"camera {subject} moved{_turned(value, deviation)}",
+    "camera": lambda model, subject, value, deviation: f"camera {subject} moved{_rotation_text(value, deviation)}",
     "cameras": lambda model, subject, value, deviation: (
-        f"the cameras moved together, or the arm's base did{_turned(value, deviation)}"
+        f"the cameras moved together, or the arm's base did{_rotation_text(value, deviation)}"
         if not model.tip_first
-        else f"the cameras moved together on the flange{_turned(value, deviation)}"
+        else f"the cameras moved together on the flange{_rotation_text(value, deviation)}"
     ),
     "body": lambda model, subject, value, deviation: (
-        f"the marker body moved on the flange{_turned(value, deviation)}"
+        f"the marker body moved on the flange{_rotation_text(value, deviation)}"
         if not model.tip_first
-        else f"the marker body, or the arm's base, moved{_turned(value, deviation)}"
+        else f"the marker body, or the arm's base, moved{_rotation_text(value, deviation)}"
     ),
     "marker": lambda model, subject, value, deviation: f"marker {subject} slipped",
     "joint": _joint_sentence,
@@ -460,16 +460,17 @@ def _message(
     limit_px: float,
 ) -> str:
     low, high = (float(chi2_distribution.ppf(tail, count)) for tail in (0.0005, 0.9995))
-    said = (
+    verdict = (
         f"residuals are {sigmas:.3g} times the expected noise over {count} measurements (chi-square {chi2:.0f}; "
         f"{low:.0f} to {high:.0f} expected)"
     )
     because = "; ".join(cause.message for cause in named)
     if status == "holds":
-        return f"model holds: {said}"
+        return f"model holds: {verdict}"
     if status == "drifting":
-        return f"model holds, but it drifts: {because}; below the limit of {limit_px:g} px. {said[0].upper()}{said[1:]}"
-    return f"recalibrate because {because}. {said[0].upper()}{said[1:]}"
+        drift = f"model holds, but it drifts: {because}; below the limit of {limit_px:g} px"
+        return f"{drift}. {verdict[0].upper()}{verdict[1:]}"
+    return f"recalibrate because {because}. {verdict[0].upper()}{verdict[1:]}"
 
 
 DISTINGUISHABLE = 25.0
@@ -508,10 +509,10 @@ def reset_zeros(
         for j, x, s in zip(at, drift, deviations, strict=True)
     )
     stated = model.covariance
-    told = ", ".join(f"{joint.joint} {_amount(joint)}" for joint in joints)
+    changes = ", ".join(f"{joint.joint} {_amount(joint)}" for joint in joints)
     source = f"{model.source or 'model'} (epoch {model.epoch}); zeros reset by a check"
     source += f" at {report.created}" if report.created else ""
-    source += f": {told}" + (
+    source += f": {changes}" + (
         "" if stated is not None else "; their uncertainty is not carried, the model had no covariance"
     )
     after = float(np.sqrt(rest.chi2 / max(1, report.measurements - drift.size)))
@@ -521,8 +522,8 @@ def reset_zeros(
         joints,
         report.sigmas,
         after,
-        f"zeros reset in model epoch {epoch}: {told}; residuals {report.sigmas:.3g} times the expected noise before, "
-        f"{after:.3g} times after. Teach the goals of epoch {model.epoch} again",
+        f"zeros reset in model epoch {epoch}: {changes}; residuals {report.sigmas:.3g} times the expected noise "
+        f"before, {after:.3g} times after. Teach the goals of epoch {model.epoch} again",
     )
     return msgspec.structs.replace(
         model, epoch=epoch, created=created, source=source, zero=zero, refined_from=0, in_place_of=0,
@@ -537,7 +538,7 @@ def _must_be_zeros(report: CheckReport) -> None:
     if others:
         raise CalibrationError(
             "other_cause",
-            f"a reset of joint zeros does not cure this: {'; '.join(others)}. Remove the cause, or calibrate anew",
+            f"a reset of joint zeros does not cure this: {'; '.join(others)}. Remove the cause, or calibrate again",
             causes=others,
         )
 
@@ -561,7 +562,7 @@ def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> N
                 raise CalibrationError(
                     "not_observable",
                     f"the check does not tell a drift of {cause.subject} from one of {other.subject}: at these stops "
-                    "both move the markers alike. Take a base where their axes are different lines, or calibrate anew",
+                    "both move the markers alike. Take a base where their axes are different lines, or calibrate again",
                     joints=[cause.subject, other.subject],
                 )
 

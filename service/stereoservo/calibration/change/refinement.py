@@ -100,7 +100,7 @@ def refine_model(
     if base.covariance is None:
         raise CalibrationError(
             "no_covariance",
-            f"model epoch {base.epoch} carries no covariance, which a refinement starts from: calibrate anew",
+            f"model epoch {base.epoch} carries no covariance, which a refinement starts from: calibrate again",
         )
     poses = len(samples.positions)
     if poses < LEAST_POSES:
@@ -114,7 +114,7 @@ def refine_model(
             "model_does_not_fit",
             f"not refined: the model does not fit any more: {check.message}. That is what the poses together are most "
             "like; where the cell changed while they were collected, `calibrate --check` tells what it is. Remove the "
-            "cause, or calibrate anew",
+            "cause, or calibrate again",
             causes=[cause.message for cause in check.causes],
         )
     data = examined.problem.data
@@ -137,7 +137,7 @@ def refine_model(
             "step_too_large",
             f"not refined: the step away from calibrated model epoch {base.epoch} has chi-square {whole.chi2:.0f} by "
             f"that model's covariance, {whole.limit:.0f} is allowed: the model does not fit any more. Check it "
-            "(`calibrate --check`), or calibrate anew",
+            "(`calibrate --check`), or calibrate again",
             chi2=whole.chi2,
             limit=whole.limit,
         )
@@ -187,11 +187,11 @@ def estimate_step(base: CellModel, data: Measurements) -> RefinementStep:
     values, vectors = np.linalg.eigh(rows.T @ rows)
     values = np.maximum(values, 0.0)
     covariance = (axes @ vectors / (1.0 + values)) @ (axes @ vectors).T
-    told = values > LEAST_KNOWLEDGE
-    steps = (vectors.T @ z)[told]
+    observable = values > LEAST_KNOWLEDGE
+    steps = (vectors.T @ z)[observable]
     # Under a valid prior the estimate has the covariance M (I + M)⁻¹.
-    chi2 = float((steps**2 * (1.0 + values[told]) / values[told]).sum())
-    limit = float(chi2_distribution.isf(CHANCE, max(1, int(told.sum()))))
+    chi2 = float((steps**2 * (1.0 + values[observable]) / values[observable]).sum())
+    limit = float(chi2_distribution.isf(CHANCE, max(1, int(observable.sum()))))
     return RefinementStep(axes @ z, 0.5 * (covariance + covariance.T), chi2, limit)
 
 
@@ -213,9 +213,9 @@ def _cross_validated(
     gain = size = before = after = 0.0
     errors: list[tuple[FloatArray, FloatArray]] = []
     for fold in range(FOLDS):
-        apart = data.stop % FOLDS == fold
-        held = data.select(apart)
-        found = displaced_model(base, estimate_step(base, data.select(~apart)).x)
+        held_out = data.stop % FOLDS == fold
+        held = data.select(held_out)
+        found = displaced_model(base, estimate_step(base, data.select(~held_out)).x)
         old, new = (_seen(model, held, samples) for model in (used, found))
         B = bounded(joint_uncertainty(base, held, acting_order(base)))
         change = new - old

@@ -31,7 +31,6 @@ from stereoservo.calibration.diagnosis.marker_tracks import find_step, path_nois
 from stereoservo.calibration.diagnosis.outlier_causes import (
     SUSPICIOUS_OUTLIERS,
     camera_moved,
-    every_pixel,
     explain_outliers,
     marker_slipped,
     moved_part,
@@ -40,6 +39,7 @@ from stereoservo.calibration.diagnosis.outlier_causes import (
     residual_trials,
     scale_error,
     scaled_positions,
+    solution_with_all_pixels,
     underestimated_noise,
 )
 from stereoservo.calibration.lens_estimation import lenses_explain_more
@@ -148,7 +148,7 @@ def _step_error(trials: TrialData, result: CalibrationFit | None = None) -> Cali
     if step is None:
         return None
     if result is not None and len(step.markers) == len(left.marker_ids):
-        return moved_part(trials, every_pixel(trials, result), step.stop)
+        return moved_part(trials, solution_with_all_pixels(trials, result), step.stop)
     if len(step.cameras) < len(trials.cameras):
         return camera_moved(trials, step.cameras[0], step.stop)
     if len(step.markers) < len(left.marker_ids):
@@ -251,13 +251,15 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
     return tuple(notes)
 
 
-def untested(trials: TrialData) -> tuple[str, ...]:
+def untested_properties(trials: TrialData) -> tuple[str, ...]:
     """Notes on properties that the trials do not determine: combined effects of the joints, and their order, if they
     only move one at a time, from one configuration.
     """
     n = len(trials.joint_names)
-    apart = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(trials.positions, axis=0)
-    together = int(((trials.trials < 0) & (apart.sum(axis=1) > 1)).sum())
+    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
+        trials.positions, axis=0
+    )
+    together = int(((trials.trials < 0) & (displaced.sum(axis=1) > 1)).sum())
     bases = [np.median(trials.positions[trials.trials == j], axis=0) for j in range(n) if (trials.trials == j).any()]
     moved = bool(bases) and float(np.ptp(np.array(bases), axis=0).max(initial=0.0)) > MOVED
     if n < 2 or together >= LEAST_TOGETHER or moved:

@@ -17,7 +17,7 @@ import numpy.typing as npt
 from stereoservo.calibration.bundle_adjustment import Solution, solve
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.initial_reconstruction import MIN_MATCHES, initial_reconstruction
-from stereoservo.calibration.lens_estimation import prior_of_lenses, straight_lenses, undistorted
+from stereoservo.calibration.lens_estimation import prior_of_lenses, undistorted, undistorted_lenses
 from stereoservo.calibration.rig_model import Measurements, expected_pixels, projective_rig, stratum_rig
 from stereoservo.calibration.single_joint_fit import best_single_joint, own_trials
 from stereoservo.calibration.stratum_selection import FitOptions
@@ -84,9 +84,9 @@ def exchanged_ids(trials: TrialData, k: int) -> tuple[int, int] | None:
         return None
     best, least = None, AGREES
     for a, b in combinations(range(m), 2):
-        mended = with_ids_exchanged(trials, k, a, b)
-        F = robust_fundamental(mended, k)
-        share = 0.0 if F is None else float(np.nanmean(_marker_shares(mended, F, k)))
+        corrected = with_ids_exchanged(trials, k, a, b)
+        F = robust_fundamental(corrected, k)
+        share = 0.0 if F is None else float(np.nanmean(_marker_shares(corrected, F, k)))
         if share >= least:
             best, least = (a, b), share
     return best
@@ -381,7 +381,7 @@ def fit_of_correction(trials: TrialData, refit: Refit, options: FitOptions) -> C
 
 def pinhole_reconstruction(trials: TrialData) -> InitialViews:
     """Projective cameras, points and usable pixels by `initial_reconstruction`, with lens distortion removed."""
-    return initial_reconstruction(undistorted(trials, straight_lenses(trials)))
+    return initial_reconstruction(undistorted(trials, undistorted_lenses(trials)))
 
 
 def solution_of(trials: TrialData, result: CalibrationFit) -> Solution:

@@ -155,8 +155,8 @@ def _rigid_factor(observations: VirtualObservations, reported: FloatArray) -> fl
         if int(both.sum()) < 3:
             continue
         before, after = euclidean[k, both], euclidean[n, both]
-        turn, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
-        angle = float(turn.magnitude())
+        rotation, _ = Rotation.align_vectors(after - after.mean(axis=0), before - before.mean(axis=0))
+        angle = float(rotation.magnitude())
         if angle > 0.0:
             ratios.append(abs(reported[k] - reported[n]) / angle)
     return float(np.median(ratios)) if ratios else 1.0
@@ -174,7 +174,7 @@ def model_scales(solution: Solution) -> tuple[JointScaleEstimate, ...]:
     # Effects of a factor that the other parameters can imitate count as theirs.
     at = solution.charts.start(3)
     found = estimate_beside(factor.core[at:, at:])
-    deviations = np.sqrt(np.diag(found.covariance) * max(1.0, solution.determined.variance))
+    deviations = np.sqrt(np.diag(found.covariance) * max(1.0, solution.statistics.variance))
     return tuple(
         JointScaleEstimate(joint, float(np.exp(log)), float(np.exp(log) * deviation))
         for joint, log, deviation in zip(joints, found.x, deviations, strict=True)
@@ -191,7 +191,7 @@ def prismatic_ratios(result: CalibrationFit, solution: Solution) -> tuple[JointS
     if result.model.stratum != "metric" or len(joints) < 2:
         return ()
     lengths = np.linalg.norm(solution.rig.generators[:, :3, 3], axis=1)
-    roots = solution.determined.root * np.sqrt(max(1.0, solution.determined.variance))
+    roots = solution.statistics.root * np.sqrt(max(1.0, solution.statistics.variance))
     starts = np.cumsum([0, *(len(basis) for basis in solution.charts.generators)])
 
     def log_slope(joint: int) -> FloatArray:
@@ -244,29 +244,29 @@ class ScalesError(Exception):
 
 def explains(trials: TrialData, solution: Solution, inliers: BoolArray, components: VarianceComponents | None) -> bool:
     """Whether a bundle with joint noise leaves only noise, for readings that are not plainly wrong."""
-    if _moved_in_name_only(trials, solution):
+    if _errors_dominate_motion(trials, solution):
         return False
     return (
         components is not None
         and components.significant
-        and solution.determined.variance <= EXPLAINED**2
+        and solution.statistics.variance <= EXPLAINED**2
         and float((~inliers).mean()) <= MOST_OUTLIERS
     )
 
 
-def _moved_in_name_only(trials: TrialData, solution: Solution) -> bool:
+def _errors_dominate_motion(trials: TrialData, solution: Solution) -> bool:
     """Whether the error of a joint is a large part of its reported displacement while another one moves: a wrong
     position, not an error of a gear.
     """
     errors = solution.data.corrections
-    apart = solution.data.offsets - errors
-    errors, apart = errors - np.median(errors, axis=0), apart - np.median(apart, axis=0)
+    motion = solution.data.offsets - errors
+    errors, motion = errors - np.median(errors, axis=0), motion - np.median(motion, axis=0)
     others = trials.trials[:, None] != np.arange(errors.shape[1])
-    placed = others & (np.abs(apart) > SAME_READING)
-    return bool((placed & (np.abs(errors) > WRONG_SHARE * np.abs(apart))).any())
+    placed = others & (np.abs(motion) > SAME_READING)
+    return bool((placed & (np.abs(errors) > WRONG_SHARE * np.abs(motion))).any())
 
 
-def one_thing_happened(trials: TrialData, solution: Solution) -> bool:
+def is_single_event(trials: TrialData, solution: Solution) -> bool:
     """Whether the errors of the joints look like a single event: a wrong stop, or a lasting step."""
     errors = solution.data.corrections
     for joint in range(errors.shape[1]):

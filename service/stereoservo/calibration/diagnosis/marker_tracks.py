@@ -211,18 +211,18 @@ def path_basis(trials: TrialData) -> FloatArray:
         own = np.flatnonzero(trials.trials == joint)
         if not len(own):
             continue
-        middle = float(np.median(positions[own, joint]))
+        median = float(np.median(positions[own, joint]))
         others = np.delete(positions[own], joint, axis=1)
         keys = np.round(others / LOCKED_RANGE).astype(np.int64)
         for key in np.unique(keys, axis=0):
             group = own[(keys == key).all(axis=1)]
             base = np.median(positions[group], axis=0)
-            base[joint] = middle
+            base[joint] = median
             name = tuple(np.round(base / (10 * LOCKED_RANGE)).astype(np.int64).tolist())
             bases.setdefault(name, np.zeros(len(positions)))[group] = 1.0
             displacement = np.zeros(len(positions))
             span = max(float(np.ptp(positions[group, joint])), LOCKED_RANGE)
-            displacement[group] = 2.0 * (positions[group, joint] - middle) / span
+            displacement[group] = 2.0 * (positions[group, joint] - median) / span
             degree = min(PATH_DEGREE, (len(group) - 1) // 2)
             columns += [displacement**power for power in range(1, degree + 1)]
     return np.stack([*bases.values(), *columns], axis=1) if bases else np.zeros((len(positions), 0))

@@ -59,7 +59,7 @@ CLEARLY = 4.0
 
 
 def moved_part(trials: TrialData, start: Solution, stop: int) -> CalibrationError:
-    """Error that states what moved between ``stop`` and the previous one, from a bundle of `every_pixel`:
+    """Error that states what moved between ``stop`` and the previous one, from a bundle of `solution_with_all_pixels`:
     ``camera_moved``, ``moved_together``, or ``camera_or_body_moved`` if the pixels do not determine it.
     """
     cameras = len(trials.cameras)
@@ -69,7 +69,7 @@ def moved_part(trials: TrialData, start: Solution, stop: int) -> CalibrationErro
     except np.linalg.LinAlgError:
         return camera_or_body_moved(trials, stop)
     least = _robust_cost(everything)
-    noise = max(1.0, least / max(1, everything.determined.freedom))
+    noise = max(1.0, least / max(1, everything.statistics.freedom))
     lost = np.array([(_robust_cost(one) - least) / noise for one in alone])
     freedom = max(1, everything.charts.size - alone[0].charts.size)
     limit = float(chi2_distribution.isf(TAIL, freedom))
@@ -119,7 +119,7 @@ def camera_or_body_moved(trials: TrialData, stop: int) -> CalibrationError:
     )
 
 
-def every_pixel(trials: TrialData, result: CalibrationFit) -> Solution:
+def solution_with_all_pixels(trials: TrialData, result: CalibrationFit) -> Solution:
     """The fit's solution with all pixels of its markers, including rejected ones, without priors of its lenses."""
     solution = solution_of(trials, result)
     kept = [trials.marker_ids.index(i) for i in result.model.marker_ids]
@@ -254,7 +254,7 @@ def check_lasting_outliers(trials: TrialData, result: CalibrationFit, found: Pre
     cameras = [_lasting(found.outliers[k], found.seen[k]) for k in range(c)]
     moved = [stop for stop in cameras if stop is not None]
     if moved:
-        raise moved_part(trials, every_pixel(trials, result), min(moved))
+        raise moved_part(trials, solution_with_all_pixels(trials, result), min(moved))
     slipped = {}
     for marker in range(m):
         stop = _lasting(found.outliers[:, :, marker].T, found.seen[:, :, marker].T)
@@ -397,19 +397,19 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
     scatter = path_noise(trials)
     if not float(scatter.max()) > UNDERSTATED:
         return None
-    mended = msgspec.structs.replace(trials, sigmas=trials.sigmas * np.maximum(scatter, 1.0)[:, None])
-    result = fit_of_correction(mended, refit, options)
+    corrected = msgspec.structs.replace(trials, sigmas=trials.sigmas * np.maximum(scatter, 1.0)[:, None])
+    result = fit_of_correction(corrected, refit, options)
     if result is None:
         return None
     factor = result.report.sigma_factor
     used = result.model.statistics
     assert used is not None
-    smooth = float(np.median(path_noise(residual_trials(mended, result)))) < WHITE * factor
+    smooth = float(np.median(path_noise(residual_trials(corrected, result)))) < WHITE * factor
     wild = used.outliers > SUSPICIOUS_OUTLIERS * (used.measurements // 2 + used.outliers)
     uneven = max(joint.rms_px for joint in used.joints) > UNEVEN * min(joint.rms_px for joint in used.joints)
     if smooth or wild or uneven:
         return None  # not only noise: the model is wrong, or positions or times are
-    solution = solution_of(mended, result)
+    solution = solution_of(corrected, result)
     joints = estimate_components(reduced_rows(solution, readings(solution.data.offsets)), scales=False)
     # An effect common to all markers of a stop is no pixel noise.
     if joints is not None and joints.significant and joints.pixels * float(scatter.max()) ** 2 < UNDERSTATED**2:
@@ -435,12 +435,12 @@ def underestimated_noise(trials: TrialData, refit: Refit, options: FitOptions) -
 def _inexact_joints(trials: TrialData, found: VarianceComponents) -> CalibrationError:
     """Error for joints whose readings are so inaccurate that no fit starts from them."""
     deviations = np.sqrt(found.random + found.repeatable)
-    ways = np.ptp(trials.positions, axis=0)
+    ranges = np.ptp(trials.positions, axis=0)
     listed = ", ".join(
         f"{trials.joint_names[j]!r} by {1e3 * deviations[j]:.2g} {'mrad' if kind == 'revolute' else 'mm'} "
-        f"({deviations[j] / ways[j]:.0%} of its way)"
+        f"({deviations[j] / ranges[j]:.0%} of its way)"
         for j, kind in enumerate(trials.joint_kinds)
-        if deviations[j] > NOTABLE * float((deviations / ways).max()) * ways[j]
+        if deviations[j] > NOTABLE * float((deviations / ranges).max()) * ranges[j]
     )
     return CalibrationError(
         "joints_inexact",
@@ -469,10 +469,10 @@ def scaled_positions(
     if (factors == 1.0).all():
         return None
     for tried in _likely_factors(trials, factors):
-        mended = with_scales_removed(trials, tried)
-        result = fit_of_correction(mended, refit, options)
+        corrected = with_scales_removed(trials, tried)
+        result = fit_of_correction(corrected, refit, options)
         if result is not None:
-            return scale_error(trials, mended, result, tried)
+            return scale_error(trials, corrected, result, tried)
     return None
 
 
@@ -492,13 +492,13 @@ def _likely_factors(trials: TrialData, factors: FloatArray) -> list[FloatArray]:
 
 
 def scale_error(
-    trials: TrialData, mended: TrialData, result: CalibrationFit, factors: FloatArray
+    trials: TrialData, corrected: TrialData, result: CalibrationFit, factors: FloatArray
 ) -> CalibrationError | None:
     """Error that states wrong scales: the removed ``factors`` (n,), refined with the model of the
-    ``mended`` trials; None if none is left.
+    ``corrected`` trials; None if none is left.
     """
     found = {}
-    for scale in model_scales(solution_of(mended, result)):
+    for scale in model_scales(solution_of(corrected, result)):
         whole = JointScaleEstimate(
             scale.joint, scale.factor * factors[scale.joint], scale.deviation * factors[scale.joint]
         )

@@ -53,7 +53,7 @@ from stereoservo.calibration.examination.recorded_views import (
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-COURSE = Limits(evaluations=30, tolerance=0.0, settled=1e-6)
+TRACK_LIMITS = Limits(evaluations=30, tolerance=0.0, settled=1e-6)
 """Termination of the least-squares fit of a track."""
 ROUNDS = 6
 """Most times that the onset is estimated again."""
@@ -116,8 +116,8 @@ def step_of_camera(
     onsets = every[(every >= mine[LASTING]) & (every <= mine[-LASTING])]
     best, shifts = -1, [np.zeros_like(track.pixels) for track in tracks]
     for _ in range(ROUNDS):
-        courses = [_course(track, track.pixels - shift) for track, shift in zip(tracks, shifts, strict=True)]
-        gains, found, left, freedom = _profile(tracks, courses, onsets)
+        fits = [_fit_track(track, track.pixels - shift) for track, shift in zip(tracks, shifts, strict=True)]
+        gains, found, left, freedom = _profile(tracks, fits, onsets)
         level = max((left - float(gains.max())) / freedom, 1e-12)
         k, first, last = probable_onset(gains / level)
         span = int(onsets[first]), int(onsets[last])
@@ -126,8 +126,8 @@ def step_of_camera(
             break
         best = step.onset
         shifts = [
-            np.where((track.frames >= best)[:, None], course.warps @ found[k], 0.0)
-            for track, course in zip(tracks, courses, strict=True)
+            np.where((track.frames >= best)[:, None], fit.warps @ found[k], 0.0)
+            for track, fit in zip(tracks, fits, strict=True)
         ]
     return step
 
@@ -161,7 +161,7 @@ class _MarkerTrack(NamedTuple):
     together: bool
 
 
-class _Course(NamedTuple):
+class _TrackFit(NamedTuple):
     """Prediction (k, 2) [px] of a track by forms of the joints, its displacements ``warps`` (k, 2, q) by a step's
     parameters, and an orthonormal basis (2 k, p) of its derivatives by the forms' parameters [sigmas].
     """
@@ -177,13 +177,15 @@ def _forms(views: RecordedViews) -> tuple[FloatArray, BoolArray]:
     """
     stops = stop_positions(views, instants(views))
     alone = single_joint_motions(stops) >= 0
-    middle = np.median(stops[alone], axis=0) if alone.any() else views.positions[0]
-    apart = views.at(views.times) - middle
-    away = np.abs(apart) > ALONE
-    turns = np.array([kind == "revolute" for kind in views.joint_kinds])
-    apart = np.where(away, apart, 0.0)
-    forms = np.stack([np.where(turns, np.sin(apart), apart), np.where(turns, np.cos(apart) - 1.0, 0.0)], axis=2)
-    return forms.reshape(len(apart), -1), np.asarray(away.sum(axis=1) <= 1)
+    median = np.median(stops[alone], axis=0) if alone.any() else views.positions[0]
+    displaced = views.at(views.times) - median
+    away = np.abs(displaced) > ALONE
+    revolute = np.array([kind == "revolute" for kind in views.joint_kinds])
+    displaced = np.where(away, displaced, 0.0)
+    forms = np.stack(
+        [np.where(revolute, np.sin(displaced), displaced), np.where(revolute, np.cos(displaced) - 1.0, 0.0)], axis=2
+    )
+    return forms.reshape(len(displaced), -1), np.asarray(away.sum(axis=1) <= 1)
 
 
 def _track(
@@ -209,12 +211,12 @@ def _warps(pixels: FloatArray, half: float, together: bool) -> FloatArray:
     return np.array(rows).transpose(2, 1, 0)
 
 
-def _course(track: _MarkerTrack, pixels: FloatArray) -> _Course:
+def _fit_track(track: _MarkerTrack, pixels: FloatArray) -> _TrackFit:
     """The course fitted to a track with given pixels (k, 2): least squares (Levenberg, Marquardt), starting from forms
     without depth.
     """
-    middle, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
-    seen, weight = (pixels - middle) / size, (size / track.sigmas)[:, None]
+    centroid, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
+    seen, weight = (pixels - centroid) / size, (size / track.sigmas)[:, None]
     k, r = track.forms.shape
     terms = np.hstack([np.ones((k, 1)), track.forms])
     none = np.zeros_like(terms)
@@ -228,11 +230,11 @@ def _course(track: _MarkerTrack, pixels: FloatArray) -> _Course:
     def changes(x: FloatArray) -> FloatArray:
         return (weights * _slopes(terms, none, *_predicted(terms, x)))[:, None]
 
-    x = minimise(DenseFit(errors, changes, np.add), x, COURSE).state
-    slopes, predicted = changes(x)[:, 0], _predicted(terms, x)[0] * size + middle
+    x = minimise(DenseFit(errors, changes, np.add), x, TRACK_LIMITS).state
+    slopes, predicted = changes(x)[:, 0], _predicted(terms, x)[0] * size + centroid
     basis, values, _ = np.linalg.svd(slopes, full_matrices=False)
     basis = basis[:, values > 1e-9 * values[0]].reshape(2, k, -1).transpose(1, 0, 2).reshape(2 * k, -1)
-    return _Course(predicted, _warps(predicted, track.half, track.together), basis)
+    return _TrackFit(predicted, _warps(predicted, track.half, track.together), basis)
 
 
 def _predicted(terms: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -254,28 +256,28 @@ def _slopes(terms: FloatArray, none: FloatArray, here: FloatArray, depths: Float
 
 
 def _profile(
-    tracks: list[_MarkerTrack], courses: list[_Course], onsets: IntArray
+    tracks: list[_MarkerTrack], fits: list[_TrackFit], onsets: IntArray
 ) -> tuple[FloatArray, FloatArray, float, int]:
     """Reduction (b,) of chi-square by a step at each of ``onsets`` (b,), its parameters (b, q), chi-square without a
     step, and the degrees of freedom with one.
     """
-    q = courses[0].warps.shape[2]
+    q = fits[0].warps.shape[2]
     moment, information = np.zeros((len(onsets), q)), np.zeros((len(onsets), q, q))
     whole, left, freedom = np.zeros((len(onsets), q)), 0.0, -q
-    for track, course in zip(tracks, courses, strict=True):
+    for track, fit in zip(tracks, fits, strict=True):
         weight = np.repeat(1.0 / track.sigmas, 2)
-        W = course.warps.reshape(-1, q) * weight[:, None]
-        Q = course.basis
-        apart = (track.pixels - course.predicted).ravel() * weight
-        apart = apart - Q @ (Q.T @ apart)
+        W = fit.warps.reshape(-1, q) * weight[:, None]
+        Q = fit.basis
+        residuals = (track.pixels - fit.predicted).ravel() * weight
+        residuals = residuals - Q @ (Q.T @ residuals)
         begin = 2 * np.searchsorted(track.frames, onsets)
-        moment += sums_from(W * apart[:, None], begin)
+        moment += sums_from(W * residuals[:, None], begin)
         whole += sums_from(W * W, begin)
         information += sums_from(np.einsum("ki,kj->kij", W, W), begin)
         shared = sums_from(np.einsum("ki,kj->kij", Q, W), begin)
         information -= np.einsum("bki,bkj->bij", shared, shared)
-        left += float(apart @ apart)
-        freedom += len(apart) - Q.shape[1]
+        left += float(residuals @ residuals)
+        freedom += len(residuals) - Q.shape[1]
     # Directions that the forms explain as well carry no information.
     scale = np.sqrt(whole.clip(min=1e-12))
     scaled = information / (scale[:, :, None] * scale[:, None, :]) + KNOWN * np.eye(q)
@@ -344,11 +346,11 @@ class _Candidate:
 
 
 def best_change(
-    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
+    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], model_frame: int
 ) -> ChangePoint | None:
-    """The most probable significant change, or None; ``middle``: a frame of the model's own data."""
+    """The most probable significant change, or None; ``model_frame``: a frame of the model's own data."""
     here = problem.residuals_at(start_state(problem))
-    found = _likely_changes(problem, views, tested, middle)
+    found = _likely_changes(problem, views, tested, model_frame)
     count = here.size
     limits = check_thresholds(FALSE_ALARM, len(tested) * len(views.camera), count)
     chi2 = float(here @ problem.whitened(here))
@@ -387,11 +389,11 @@ def change_of(
 
 
 def _likely_changes(
-    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], middle: int
+    problem: ExaminedFrames, views: RecordedViews, tested: list[Hypothesis], model_frame: int
 ) -> list[ChangePoint]:
     """The changes of largest first-order gain, significant or not, estimated in full, the most likely first."""
     here = problem.residuals_at(start_state(problem))
-    candidates = [_first_order(problem, views, one, here, middle) for one in tested]
+    candidates = [_first_order(problem, views, one, here, model_frame) for one in tested]
     price = math.log(here.size)
     order = np.argsort([one.hypothesis.change.size * price - one.gain for one in candidates])[:REFINED]
     found = [_lasting(problem, views, _refined(problem, views, candidates[i]), price) for i in order.tolist()]
@@ -419,10 +421,10 @@ def _by_frame(problem: ExaminedFrames, frames: int, rows: FloatArray) -> FloatAr
 
 
 def _first_order(
-    problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, here: FloatArray, middle: int
+    problem: ExaminedFrames, views: RecordedViews, one: Hypothesis, here: FloatArray, model_frame: int
 ) -> _Candidate:
     """The best onset of a hypothesis, to a block of frames: later frames are changed if it is after
-    ``middle``, else earlier ones; for stamps either.
+    ``model_frame``, else earlier ones; for stamps either.
     """
     concerned = frames_concerned(one, views)
     slopes = change_jacobian(problem, (one.change,), np.zeros(one.change.size), here)
@@ -446,7 +448,7 @@ def _first_order(
         best = _Candidate(one, True, 0, float(later[0]))
     for k, onset in enumerate(onsets.tolist()):
         # A model that was learnt at rest does not depend on stamps.
-        for after in (True, False) if one.kind == "stamps" else (onset > middle,):
+        for after in (True, False) if one.kind == "stamps" else (onset > model_frame,):
             gain = float(later[k + 1] if after else before[k])
             if gain > best.gain:
                 best = _Candidate(one, after, onset, gain)
@@ -510,8 +512,8 @@ def change_effect(part: ExaminedFrames, changes: tuple[ModelChange, ...], x: Flo
     """Change (r, 2) [px] of the pixels, observed minus predicted, by changes ``x`` (q,)."""
     plain = replace(part, joint_slopes=np.zeros((0, len(part.order))))
     changed = plain.residuals_at(changed_state(plain, changes, x))
-    apart = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
-    return np.asarray(apart * part.data.sigmas[:, None])
+    effect = (changed - plain.residuals_at(start_state(plain))).reshape(-1, 2)
+    return np.asarray(effect * part.data.sigmas[:, None])
 
 
 def _onset(

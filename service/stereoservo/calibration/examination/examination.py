@@ -56,9 +56,9 @@ from stereoservo.calibration.trial_data import CalibrationError
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 
-PUT_BACK = 2
+CORRECTION_ROUNDS = 2
 """Rounds of removing a moved camera's displacement from its pixels by a model, and learning the model again."""
-MENDS, TRIED = 2, 2
+MOST_CORRECTIONS, TRIED = 2, 2
 """Most changes that are removed before learning, and number of candidates tried for each."""
 FREE = 30.0
 """Factor on the model's standard deviations with which it counts as free: effects of a model error prove nothing."""
@@ -82,24 +82,24 @@ class _Step(NamedTuple):
     beside: Hypothesis | None = None
 
 
-def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
+def learn_corrected(views: RecordedViews) -> tuple[RecordedViews, ReferenceModel, list[ChangePoint]]:
     """Recording with corrected stamps and joints, the model learnt from it, and the changes that were removed. Raises
     LearningError, CalibrationError (``bad_data``, ``too_few_stops``).
     """
     try:
         reference = learn_reference(views)
     except LearningError:
-        moved = _learnt_beside_step(views)
+        moved = _learnt_despite_step(views)
         if moved is None:
             raise
         return views, moved, []
-    moved = _learnt_beside_step(views)
+    moved = _learnt_despite_step(views)
     if moved is not None and moved.scatter_px * AS_GOOD < reference.scatter_px:
         return views, moved, []
-    views = reference.put_right(views)
+    views = reference.corrected(views)
     found: list[_Step] = []
-    while len(found) < MENDS and not reference.fits:
-        better = _better(views, reference)
+    while len(found) < MOST_CORRECTIONS and not reference.fits:
+        better = _with_one_correction(views, reference)
         if better is None:
             break
         views, reference, step = better
@@ -107,7 +107,7 @@ def learnt_and_put_right(views: RecordedViews) -> tuple[RecordedViews, Reference
     return views, reference, [_change(views, reference, step) for step in found]
 
 
-def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
+def _learnt_despite_step(views: RecordedViews) -> ReferenceModel | None:
     """Model of an arm and its cameras in their initial state, if one camera moved while the arm is learnt, with that
     camera's later pixels corrected; None if none moved, or more than noise is left.
 
@@ -116,15 +116,15 @@ def _learnt_beside_step(views: RecordedViews) -> ReferenceModel | None:
     camera = moved_camera(views) if views.generators is None else None
     if camera is None or (step := step_of_camera(views, camera)) is None:
         return None
-    reference = _learnt(without_step(views, camera, step))
-    for _ in range(PUT_BACK):
+    reference = _learnt_or_none(without_step(views, camera, step))
+    for _ in range(CORRECTION_ROUNDS):
         if reference is None:
             return None
-        reference = _learnt(_put_back(views, reference, camera, step.onset))
+        reference = _learnt_or_none(_without_camera_motion(views, reference, camera, step.onset))
     return replace(reference, of_first=True) if reference is not None and reference.fits else None
 
 
-def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onset: int) -> RecordedViews:
+def _without_camera_motion(views: RecordedViews, reference: ReferenceModel, camera: int, onset: int) -> RecordedViews:
     """The recording with a camera's motion, estimated by a model, removed from its pixels from frame ``onset`` on."""
     problem = examined_frames(reference.model, views, reference.noise_factor)
     name = views.cameras[camera].name
@@ -138,9 +138,11 @@ def _put_back(views: RecordedViews, reference: ReferenceModel, camera: int, onse
     return replace(views, pixels=pixels)
 
 
-def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
+def _with_one_correction(
+    views: RecordedViews, reference: ReferenceModel
+) -> tuple[RecordedViews, ReferenceModel, _Step] | None:
     """Recording and model without the change that explains most; None if the model is no better without it."""
-    model, problem = _freed(views, reference)
+    model, problem = _with_free_model(views, reference)
     # A model learnt at rest does not depend on stamps.
     kinds = ("joint",) if reference.at_rest else ("joint", "stamps")
     steps = [_step(problem, views, one) for one in hypotheses(model, views, problem) if one.kind in kinds]
@@ -150,9 +152,9 @@ def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedVi
         frames = np.zeros(len(views.camera), dtype=np.bool_)
         concerned = frames_concerned(step.hypothesis, views)
         frames[concerned[concerned >= step.onset]] = True
-        mended = corrected_views(views, step.hypothesis, frames, step.x)
-        again = None if mended is None else _learnt(mended)
-        if mended is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
+        corrected = corrected_views(views, step.hypothesis, frames, step.x)
+        again = None if corrected is None else _learnt_or_none(corrected)
+        if corrected is not None and again is not None and again.scatter_px * AS_GOOD < reference.scatter_px:
             offsets = reference.offsets + again.offsets
             alike = [
                 other.hypothesis
@@ -162,18 +164,18 @@ def _better(views: RecordedViews, reference: ReferenceModel) -> tuple[RecordedVi
                 and max(step.span[0], other.span[0]) <= min(step.span[1], other.span[1])
             ]
             step = step._replace(beside=alike[0] if alike else None)
-            return again.put_right(mended), replace(again, offsets=offsets), step
+            return again.corrected(corrected), replace(again, offsets=offsets), step
     return None
 
 
-def _learnt(views: RecordedViews) -> ReferenceModel | None:
+def _learnt_or_none(views: RecordedViews) -> ReferenceModel | None:
     try:
         return learn_reference(views)
     except (LearningError, CalibrationError):
         return None
 
 
-def _freed(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, ExaminedFrames]:
+def _with_free_model(views: RecordedViews, reference: ReferenceModel) -> tuple[CellModel, ExaminedFrames]:
     """The model without errors of its joints, and the problem of all frames with that model nearly free."""
     exact = msgspec.structs.replace(reference.model, joint_accuracy=None)
     problem = examined_frames(exact, views, reference.noise_factor)
@@ -219,7 +221,7 @@ def _change(views: RecordedViews, reference: ReferenceModel, step: _Step) -> Cha
     is included in the deviation.
     """
     problem = examined_frames(reference.model, views, reference.noise_factor)
-    model, free = _freed(views, reference)
+    model, free = _with_free_model(views, reference)
     named = {(one.kind, one.subject): one for one in hypotheses(model, views, free)}
     one = named[step.hypothesis.kind, step.hypothesis.subject]
     left = _step(free, views, one, step.onset)
@@ -347,7 +349,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     lost = _dropped(views)
     dropped = {camera.name: gaps(views, c) for c, camera in enumerate(views.cameras)}
     try:
-        views, reference, found = learnt_and_put_right(views)
+        views, reference, found = learn_corrected(views)
     except LearningError as failed:
         return _not_learnt(views, failed, lost, dropped)
     model = reference.model
@@ -357,7 +359,7 @@ def examine_views(views: RecordedViews) -> RecordingReport:
     before = _residuals_px(problem)
     tested = hypotheses(model, views, problem)
     while len(found) < MOST_CHANGES:
-        change = best_change(problem, views, tested, reference.middle)
+        change = best_change(problem, views, tested, reference.middle_frame)
         if change is None:
             break
         found.append(change)
@@ -533,7 +535,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
     or_else = tells = ""
     if change.runner_up is not None:
         or_else = _sentence(model, change.runner_up, None, None)
-        tells = _tells_apart(one, change.runner_up)
+        tells = _distinguishing_data(one, change.runner_up)
         text += f"; or {or_else}: the recording does not tell. What would: {tells}"
     return RecordingCause(
         _KINDS[one.kind], one.subject, f"{text}; {change.effect_px:.3g} px rms", onset, change.effect_px,
@@ -541,7 +543,7 @@ def _cause(model: CellModel, views: RecordedViews, change: ChangePoint) -> Recor
     )  # fmt: skip
 
 
-def _tells_apart(one: Hypothesis, other: Hypothesis) -> str:
+def _distinguishing_data(one: Hypothesis, other: Hypothesis) -> str:
     kinds = {one.kind, other.kind}
     if "stamps" in kinds:
         return "frames with the arm at rest, which a late stamp does not move"
@@ -724,7 +726,7 @@ def _by_camera(
 
 def _by_joint(views: RecordedViews, problem: ExaminedFrames, left: FloatArray) -> dict[str, float]:
     """Residuals of the frames in which each joint is away from its median."""
-    there = views.at(views.times)
-    apart = np.abs(there - np.median(there, axis=0))
-    away: BoolArray = apart > AWAY * apart.max(axis=0)
+    positions = views.at(views.times)
+    displaced = np.abs(positions - np.median(positions, axis=0))
+    away: BoolArray = displaced > AWAY * displaced.max(axis=0)
     return {name: _rms(left[away[problem.data.stop, j]]) for j, name in enumerate(views.joint_names)}

@@ -105,8 +105,8 @@ class RecordedViews:
 
     def speeds(self, times: FloatArray) -> FloatArray:
         """Speed (k,) [rad/s or m/s] of the fastest joint about ``times`` (k,)."""
-        apart = np.abs(self.at(times + SPEED_OVER_S) - self.at(times - SPEED_OVER_S))
-        return np.asarray(apart.max(axis=1) / (2.0 * SPEED_OVER_S))
+        travel = np.abs(self.at(times + SPEED_OVER_S) - self.at(times - SPEED_OVER_S))
+        return np.asarray(travel.max(axis=1) / (2.0 * SPEED_OVER_S))
 
     def select(self, frames: BoolArray | IntArray) -> RecordedViews:
         """The recording with some of its frames."""
@@ -121,7 +121,7 @@ class RecordedViews:
         return replace(self, times=times, added=added).select(np.argsort(times, kind="stable"))
 
 
-def frames_apart(views: RecordedViews) -> TrialData:
+def frames_as_stops(views: RecordedViews) -> TrialData:
     """Trial data with every frame as a separate stop, at its own stamp."""
     f, m = views.sigmas.shape
     shape = (len(views.cameras), f, m)
@@ -202,17 +202,17 @@ def instants(views: RecordedViews) -> IntArray:
         still = views.speeds(views.times) <= AT_REST
         began = still & ~np.concatenate([[False], still[:-1]])
         # Between two rests the arm may have moved between two frames.
-        there = views.at(views.times)
-        jumped = np.abs(np.diff(there, axis=0)).max(axis=1) > ALONE
+        positions = views.at(views.times)
+        jumped = np.abs(np.diff(positions, axis=0)).max(axis=1) > ALONE
         began |= still & np.concatenate([[False], jumped])
         rests = np.where(still, np.cumsum(began) - 1, -1)
         if int(rests.max(initial=-1)) + 1 >= LEAST_RESTS:
-            return _standing(rests, views)
-    apart = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
-    return np.asarray(np.cumsum(apart))
+            return _static_frames(rests, views)
+    separate = np.diff(views.times, prepend=views.times[:1]) > (SAME_INSTANT_S if views.timed else 0.0)
+    return np.asarray(np.cumsum(separate))
 
 
-def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
+def _static_frames(rests: IntArray, views: RecordedViews) -> IntArray:
     """Rests (f,) without the frames whose markers differ from those nearest to the middle of the rest, by
     camera: with wrong stamps, the first or the last ones show motion.
     """
@@ -223,11 +223,11 @@ def _standing(rests: IntArray, views: RecordedViews) -> IntArray:
             if not len(mine):
                 continue
             times = views.times[mine]
-            middle = mine[np.abs(times - 0.5 * (times[0] + times[-1])).argmin()]
-            apart = np.linalg.norm(views.pixels[mine] - views.pixels[middle], axis=2)
-            sigmas = np.sqrt(views.sigmas[mine] ** 2 + views.sigmas[middle] ** 2)
-            both = np.isfinite(apart) & np.isfinite(sigmas)
-            squares = (np.where(both, apart / sigmas, 0.0) ** 2).sum(axis=1)
+            reference = mine[np.abs(times - 0.5 * (times[0] + times[-1])).argmin()]
+            distances = np.linalg.norm(views.pixels[mine] - views.pixels[reference], axis=2)
+            sigmas = np.sqrt(views.sigmas[mine] ** 2 + views.sigmas[reference] ** 2)
+            both = np.isfinite(distances) & np.isfinite(sigmas)
+            squares = (np.where(both, distances / sigmas, 0.0) ** 2).sum(axis=1)
             kept[mine[squares > MOVED * 2.0 * both.sum(axis=1)]] = -1
     return kept
 
@@ -366,8 +366,8 @@ class ExaminedFrames(LinearisedProblem):
         rig, drift = state
         if rig.generators is not self.rig.generators or drift.any():
             return super().residuals_at(state)
-        apart = predicted(rig, self.data, self._undrifted) - self.data.pixels
-        return np.asarray((apart / self.data.sigmas[:, None]).ravel())
+        residuals = predicted(rig, self.data, self._undrifted) - self.data.pixels
+        return np.asarray((residuals / self.data.sigmas[:, None]).ravel())
 
     def residuals_at(self, state: State) -> FloatArray:
         return self.without_joint_errors(self.plain_residuals_at(state)[:, None])[:, 0]
@@ -421,7 +421,7 @@ def partly_changed(problem: ExaminedFrames, changed: BoolArray) -> PartlyChanged
 def examined_frames(model: CellModel, views: RecordedViews, noise_factor: float) -> ExaminedFrames:
     """The problem of all frames; ``noise_factor`` >= 1 multiplies every sigma. Raises CalibrationError."""
     exact = msgspec.structs.replace(model, joint_accuracy=None)
-    plain = linearised_problem(exact, frames_apart(views), None, noise_factor)
+    plain = linearised_problem(exact, frames_as_stops(views), None, noise_factor)
     order = np.argsort(plain.data.stop, kind="stable")
     data = plain.data.select(order)
     root = unbounded(plain.uncertainty)[(2 * order[:, None] + np.arange(2)).ravel()]
@@ -456,11 +456,11 @@ def hypotheses(model: CellModel, views: RecordedViews, problem: ExaminedFrames) 
 
 def _late(views: RecordedViews, problem: ExaminedFrames, subject: str, frames: BoolArray) -> Hypothesis:
     """Hypothesis that the stamps of some frames (f,) are early or late by one parameter [s], which is added to them."""
-    order, there = list(problem.order), views.at(views.times)
+    order, positions = list(problem.order), views.at(views.times)
 
     def apply(state: State, x: FloatArray) -> State:
-        apart = np.where(frames[:, None], views.at(views.times + float(x[0])) - there, 0.0)
-        return state[0], state[1] + apart[:, order]
+        shift = np.where(frames[:, None], views.at(views.times + float(x[0])) - positions, 0.0)
+        return state[0], state[1] + shift[:, order]
 
     return Hypothesis(kind="stamps", subject=subject, change=ModelChange("joint", subject, 1, apply))
 

@@ -29,9 +29,9 @@ from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
-SOUGHT_S, GRID_S = 0.2, 0.02
+LARGEST_OFFSET_S, GRID_S = 0.2, 0.02
 """Largest offset that is tried in either direction, and the spacing of the offsets."""
-TOLD_S = 2e-3
+LEAST_OFFSET_S = 2e-3
 """Smaller offsets are estimated by the examination, which uses the calibrated cameras."""
 MARKERS = 4
 """Number of markers that are used, those seen most often."""
@@ -41,7 +41,7 @@ SPARE = 2.0
 """Least number of rows per unknown."""
 
 
-class Course(NamedTuple):
+class OffsetEstimate(NamedTuple):
     """Result for some frames: ``offsets`` (c,) [s] of each camera's images after their stamps, and the remaining mean
     square [sigmas²] of the worst camera.
     """
@@ -50,14 +50,14 @@ class Course(NamedTuple):
     misfit: float
 
 
-def course(views: RecordedViews, frames: IntArray) -> Course:
-    """The `Course` of ``frames`` (k,) of a recording with known displacements.
+def estimate_offsets(views: RecordedViews, frames: IntArray) -> OffsetEstimate:
+    """The `OffsetEstimate` of ``frames`` (k,) of a recording with known displacements.
 
     A pixel is a ratio of linear forms in the entries of the body's displacement, for any camera and marker: fitted
     to each marker at the displacements of many offsets (direct linear transformation, depths as weights).
     """
     offsets, left = np.zeros(len(views.cameras)), 0.0
-    grid = np.arange(-SOUGHT_S, SOUGHT_S + 0.5 * GRID_S, GRID_S) if views.timed else np.zeros(1)
+    grid = np.arange(-LARGEST_OFFSET_S, LARGEST_OFFSET_S + 0.5 * GRID_S, GRID_S) if views.timed else np.zeros(1)
     for c in range(len(views.cameras)):
         mine = frames[views.camera[frames] == c]
         costs = np.array([_misfit(views, mine, float(late)) for late in grid])
@@ -68,11 +68,11 @@ def course(views: RecordedViews, frames: IntArray) -> Course:
         if 0 < k < len(grid) - 1:
             bend = costs[k - 1] - 2.0 * costs[k] + costs[k + 1]
             finer = late + 0.5 * GRID_S * float(costs[k - 1] - costs[k + 1]) / max(float(bend), 1e-300)
-            if (there := _misfit(views, mine, finer)) <= least:
-                late, least = finer, there
-            offsets[c] = late if abs(late) >= TOLD_S else 0.0
+            if (refined := _misfit(views, mine, finer)) <= least:
+                late, least = finer, refined
+            offsets[c] = late if abs(late) >= LEAST_OFFSET_S else 0.0
         left = max(left, least)
-    return Course(offsets, left)
+    return OffsetEstimate(offsets, left)
 
 
 def _misfit(views: RecordedViews, mine: IntArray, late: float) -> float:
@@ -87,9 +87,9 @@ def _misfit(views: RecordedViews, mine: IntArray, late: float) -> float:
         if 2 * known.sum() < SPARE * 3 * forms.shape[1]:
             continue
         pixels, sigmas = views.pixels[mine[known], marker], views.sigmas[mine[known], marker]
-        apart, unknowns = _fitted(forms[known], pixels)
-        cost += float(((apart / sigmas[:, None]) ** 2).sum())
-        freedom += apart.size - unknowns
+        residuals, unknowns = _fitted(forms[known], pixels)
+        cost += float(((residuals / sigmas[:, None]) ** 2).sum())
+        freedom += residuals.size - unknowns
     return cost / freedom if freedom > 0 else np.inf
 
 
@@ -106,8 +106,8 @@ def _forms(views: RecordedViews, times: FloatArray) -> FloatArray:
 
 def _fitted(forms: FloatArray, pixels: FloatArray) -> tuple[FloatArray, int]:
     """Residuals (k, 2) of pixels fitted by ratios of linear forms (k, r), and the number of unknowns."""
-    middle, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
-    x = (pixels - middle) / size
+    centroid, size = pixels.mean(axis=0), max(float(pixels.std()), 1e-9)
+    x = (pixels - centroid) / size
     r = forms.shape[1]
     depths = np.ones(len(forms))
     answer = np.zeros(3 * r - 1)
@@ -152,12 +152,12 @@ class ReferenceModel:
     of_first: bool = False
     """Whether it describes the first frames: later ones were corrected to learn from them."""
 
-    def put_right(self, views: RecordedViews) -> RecordedViews:
+    def corrected(self, views: RecordedViews) -> RecordedViews:
         """The recording with the stamps with which the model was learnt."""
         return views.shifted(self.offsets[views.camera]) if self.offsets.any() else views
 
     @property
-    def middle(self) -> int:
+    def middle_frame(self) -> int:
         """A frame of the model's own data; -1 if it existed before the first one."""
         return -1 if self.of_first else (self.first + self.last) // 2
 
@@ -204,16 +204,16 @@ def learn_reference(views: RecordedViews) -> ReferenceModel:
         return _attempt(views, *_single_joint_stretch(views), none)
     f = len(views.camera)
     stretches = (0, f - 1), (0, f // 2 - 1), (f // 2, f - 1)
-    courses = [course(views, np.arange(first, last + 1)) for first, last in stretches]
+    offset_estimates = [estimate_offsets(views, np.arange(first, last + 1)) for first, last in stretches]
     # A part that contains a change does not fit one course.
     whole, *halves = range(3)
-    halves.sort(key=lambda k: courses[k].misfit)
-    clean = courses[whole].misfit <= AS_GOOD**2 * max(1.0, courses[halves[0]].misfit)
+    halves.sort(key=lambda k: offset_estimates[k].misfit)
+    clean = offset_estimates[whole].misfit <= AS_GOOD**2 * max(1.0, offset_estimates[halves[0]].misfit)
     order = [whole, *halves] if clean else [*halves, whole]
     failed: LearningError | None = None
     for k in order:
         try:
-            return _attempt(views, *stretches[k], courses[k].offsets)
+            return _attempt(views, *stretches[k], offset_estimates[k].offsets)
         except LearningError as error:
             failed = failed or error
     assert failed is not None
@@ -230,21 +230,22 @@ def frame_noise(views: RecordedViews) -> float:
     for c in range(len(views.cameras)):
         mine = np.flatnonzero(views.camera == c)
         pixels = views.pixels[mine] / views.sigmas[mine][..., None]
-        there, resting = views.at(views.times[mine]), still[mine]
-        same = resting[1:] & resting[:-1] & (np.abs(np.diff(there, axis=0)).max(axis=1) <= ALONE)
+        positions, resting = views.at(views.times[mine]), still[mine]
+        same = resting[1:] & resting[:-1] & (np.abs(np.diff(positions, axis=0)).max(axis=1) <= ALONE)
         by_order[1].append(_noise(np.diff(pixels, axis=0)[same], 1))
         for order in ORDERS:
-            apart = np.diff(pixels, n=order, axis=0)
+            differences = np.diff(pixels, n=order, axis=0)
             by_order[order] += [
-                _noise(apart[begin : begin + NOISE_BLOCK], order) for begin in range(0, len(apart), NOISE_BLOCK)
+                _noise(differences[begin : begin + NOISE_BLOCK], order)
+                for begin in range(0, len(differences), NOISE_BLOCK)
             ]
     known = [[one for one in found if math.isfinite(one)] for found in by_order.values()]
     return max(1.0, min((float(np.quantile(found, LOW)) for found in known if found), default=1.0))
 
 
-def _noise(apart: FloatArray, order: int) -> float:
-    """Standard deviation of values with differences ``apart`` of an ``order``, by their median; infinite if too few."""
-    values = np.abs(apart[np.isfinite(apart)])
+def _noise(differences: FloatArray, order: int) -> float:
+    """Standard deviation of values from their ``differences`` of an ``order``, by the median; infinite for too few."""
+    values = np.abs(differences[np.isfinite(differences)])
     if len(values) < LEAST_VALUES:
         return math.inf
     return 1.4826 * float(np.median(values)) / math.sqrt(math.comb(2 * order, order))

@@ -48,7 +48,7 @@ from stereoservo.control.step_correction import (
     exponential_into,
     rigid_motions,
 )
-from stereoservo.kinematics.composition import PresentArm
+from stereoservo.kinematics.composition import CurrentArm
 from stereoservo.kinematics.kernels import multiply4_into, transform_points, transform_points_into
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
@@ -300,7 +300,7 @@ def cartesian_step(
             for j in range(n):
                 velocity[j] *= share
     else:
-        _exact_into(PresentArm(operators, composition), task, parts, steps, dt_s, velocity)
+        _exact_into(CurrentArm(operators, composition), task, parts, steps, dt_s, velocity)
     if visibility.hinge_first:
         errors[1] = visibility.whole
         shown[1] = WAITS
@@ -318,7 +318,7 @@ def _shortened(step: FloatArray) -> float:
 
 @kernel
 def _exact_into(
-    arm: PresentArm, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float, velocity: FloatArray
+    arm: CurrentArm, task: FaceTask, parts: Components, steps: FloatArray, dt_s: float, velocity: FloatArray
 ) -> None:
     """Compute the joint ``velocity`` (n,) of the components' ``steps`` (k,), corrected for the time for which it is
     held.
@@ -390,7 +390,7 @@ class Stepped(NamedTuple):
 
 
 @kernel
-def _normalised_step_into(arm: PresentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped) -> None:
+def _normalised_step_into(arm: CurrentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped) -> None:
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
     the task error are in the frame of the arguments.
 
@@ -548,7 +548,7 @@ def cartesian3_step(
 @kernel
 def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields, stepped: Fields) -> None:
     """`_normalised_step_into` for Python, with the fields of all records."""
-    _normalised_step_into(PresentArm(*arm), BodyTask(*task), eyes, Rates(*rates), Stepped(*stepped))
+    _normalised_step_into(CurrentArm(*arm), BodyTask(*task), eyes, Rates(*rates), Stepped(*stepped))
 
 
 @kernel
@@ -556,7 +556,7 @@ def fill_step(room: Record, count: int) -> None:
     """Compute the step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
     work = room[0]
     n, m, c = work.joints, work.markers, work.eye_count
-    arm = PresentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
+    arm = CurrentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
     task = BodyTask(
         work.body[: 4 * m].reshape((m, 4)),
         work.target_points[: 4 * m].reshape((m, 4)),

@@ -12,7 +12,7 @@ import numpy as np
 from stereoservo.control.law import Law, LawProperties, LawStep, Options, Scene, Task
 from stereoservo.control.laws.stereo import Body, View, image_equations_into, image_reasons, limited
 from stereoservo.control.step_correction import CONVERGED, ITERATIONS, SLACK, joint_screws, step_into
-from stereoservo.kinematics.composition import PresentArm
+from stereoservo.kinematics.composition import CurrentArm
 from stereoservo.kinematics.kernels import project_points, transform_points_into
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import Fields, kernel
@@ -62,7 +62,7 @@ def trajectory_step(
 ) -> tuple[FloatArray, float]:
     """Joint velocity (n,) and conditioning; for ``dt_s`` > 0 refined by Newton's method on the images.
 
-    The fields of a `PresentArm`, a `View`, of `PlannedJoints` and of a `HeldStep`; ``points`` (m, 4).
+    The fields of a `CurrentArm`, a `View`, of `PlannedJoints` and of a `HeldStep`; ``points`` (m, 4).
     """
     seen, joints = View(*view), PlannedJoints(*plan)
     operators, composition = arm
@@ -89,13 +89,13 @@ def trajectory_step(
     else:
         conditioning = damped_solve(N, b, damping, x)
     if dt_s > 0.0 and conditioning != 0.0:
-        present, longer = PresentArm(operators, composition), HeldStep(held, dt_s, damping)
+        present, longer = CurrentArm(operators, composition), HeldStep(held, dt_s, damping)
         _refine(present, seen, points, Pull(pull, meant, planned), longer, x)
     return x, conditioning
 
 
 @kernel
-def _refine(arm: PresentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray) -> None:
+def _refine(arm: CurrentArm, view: View, points: FloatArray, plan: Pull, held_step: HeldStep, x: FloatArray) -> None:
     """Refine a held velocity ``x`` (n,), so that the images move as intended to all orders; the gain is that of a
     velocity that is held.
     """

@@ -46,7 +46,7 @@ from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.numerics.compilation import kernel
-from stereoservo.planning.path_search import MISSING_FREEDOMS, plan_on
+from stereoservo.planning.path_search import MISSING_FREEDOMS, continue_planning
 from stereoservo.planning.plan import ClosestApproach, Plan, PlanLimits, PlanRequest
 from stereoservo.planning.planner import PlanRequestError, start_planning
 
@@ -111,7 +111,7 @@ def _plan_request(
         camera_centres=camera_centres,
         points=points.copy(),
         targets=source.target_points.copy(),
-        kept=kept,
+        must_stay_visible=kept,
         centre=centre_of(source, joints + context.state.block.correction, arrays, points),
         centre_target=source.centre_target.copy(),
         faces=kept_faces(source.faces, points, source.target_points, matrices, camera_centres),
@@ -150,7 +150,7 @@ def go_on_planning(job: PlanJob) -> bool:
         return True
     request = planning.request
     pixels = len(request.points) * len(request.matrices)
-    plan_on(planning, min(SLICE, PIXELS_PER_STEP // pixels or PIXELS_PER_STEP / pixels))
+    continue_planning(planning, min(SLICE, PIXELS_PER_STEP // pixels or PIXELS_PER_STEP / pixels))
     return planning.finished and pixels <= PIXELS_PER_STEP
 
 
@@ -181,7 +181,7 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
         joints={},
         pixels={},
     )
-    at_goal = failures[0].share >= 1.0
+    at_goal = failures[0].path_parameter >= 1.0
     path = context.derived.laws[source.law].path
     if path == "free" and not at_goal:
         return report
@@ -244,7 +244,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     count = min(reported_samples(arrays), len(plan.times))
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
-    way = plan.way
+    way = plan.description
     path = context.derived.laws[source.law].path
     if path != "planned":
         seconds = max(seconds, _exponential_s(job, context))
@@ -255,7 +255,7 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
         way=way,
         seconds=seconds,
         approaches=tuple(_approach(approach, job, context) for approach in plan.approaches),
-        shares=tuple(float(plan.shares[k]) for k in at),
+        shares=tuple(float(plan.path_parameters[k]) for k in at),
         joints={name: tuple(float(plan.joints[k, j]) for k in at) for j, name in enumerate(settings.joint_names)},
         pixels={
             camera.name: pixels
@@ -298,18 +298,18 @@ def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> 
     settings, arrays = context.settings, context.arrays
     assert arrays is not None
     index = approach.index
-    if approach.what == "JOINT_LIMIT":
+    if approach.kind == "JOINT_LIMIT":
         subject = settings.joint_names[index]
-    elif approach.what == "KEEP_OUT":
+    elif approach.kind == "KEEP_OUT":
         subject = settings.limits.keep_out_names[index]
-    elif approach.what == "NOT_REACHABLE":
+    elif approach.kind == "NOT_REACHABLE":
         subject = MISSING_FREEDOMS[index] if 0 <= index < len(MISSING_FREEDOMS) else ""
     else:
         assert job.source is not None
         subject = settings.cameras[int(np.flatnonzero(job.source.used > 0.0)[index])].name
     return goals.Approach(
-        approach.what, subject, approach.value, approach.limit, approach.room, approach.unit, approach.share,
-        arrays.marker_ids[approach.marker] if approach.marker >= 0 else None,
+        approach.kind, subject, approach.value, approach.limit, approach.clearance, approach.unit,
+        approach.path_parameter, arrays.marker_ids[approach.marker] if approach.marker >= 0 else None,
     )  # fmt: skip
 
 

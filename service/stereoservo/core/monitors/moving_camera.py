@@ -22,7 +22,7 @@ from stereoservo.calibration.change.change_detection_kernel import (
     ROUNDS,
     Displaced,
     DisplacementGroup,
-    SightedPoints,
+    ObservedPoints,
     fit_displacement,
 )
 from stereoservo.calibration.change.hypothesis_test import chi2_quantile
@@ -514,7 +514,7 @@ def adjust(
         count = int((weights > 0.0).sum())
         if count < FEWEST:
             return None
-        seen = SightedPoints(matrices, points, targets, weights[None])
+        seen = ObservedPoints(matrices, points, targets, weights[None])
         chi2, _ = fit_displacement(
             seen, 0, DisplacementGroup(basis, 0, FREEDOMS), len(points), ROUNDS, Displaced(D, twist)
         )

@@ -34,7 +34,7 @@ from stereoservo.calibration.rig_model import Measurements, acting_order, acting
 from stereoservo.calibration.trial_data import TrialData
 from stereoservo.calibration.variance_components import noise_of_accuracy, readings
 from stereoservo.kinematics.denavit_hartenberg import (
-    DH_HEAD,
+    DH_HEADER,
     ReadOutError,
     decimals,
     denavit_hartenberg,
@@ -312,7 +312,7 @@ def _dimensions(model: CellModel, text: str) -> list[str]:
         heading,
         "<p>Row of a joint: what it does and the link behind it, Rz(θ) Tz(d) Tx(a) Rx(α) Ry(β); θ of a turning "
         "joint and d of a sliding one are offsets at position 0. Values in brackets are set by the convention.</p>",
-        _table(DH_HEAD, [dh_cells(row) for row in rows]),
+        _table(DH_HEADER, [dh_cells(row) for row in rows]),
     ]
 
 

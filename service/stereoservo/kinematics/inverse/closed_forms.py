@@ -38,7 +38,7 @@ def single(step: float, excess: float = 0.0, free: bool = False) -> Branches:
     return Branches(np.array([[step]]), np.array([[excess]]), np.array([[free]]))
 
 
-def beside(first: Branches, second: Branches) -> Branches:
+def append_joints(first: Branches, second: Branches) -> Branches:
     """Branches with the joints of ``second`` appended to those of ``first``; a single candidate is combined with all
     others.
     """
@@ -51,7 +51,7 @@ def beside(first: Branches, second: Branches) -> Branches:
     return Branches(wide(first.steps, second.steps), wide(first.excess, second.excess), wide(first.free, second.free))
 
 
-def together(several: list[Branches]) -> Branches:
+def concatenate(several: list[Branches]) -> Branches:
     """Concatenation of the candidates of ``several``."""
     return Branches(
         np.concatenate([branches.steps for branches in several]),
@@ -60,7 +60,7 @@ def together(several: list[Branches]) -> Branches:
     )
 
 
-def one_of(branches: Branches, i: int) -> Branches:
+def candidate(branches: Branches, i: int) -> Branches:
     """Candidate ``i`` as branches."""
     part = slice(i, i + 1)
     return Branches(branches.steps[part], branches.excess[part], branches.free[part])
@@ -151,8 +151,8 @@ def normal_plane(G: FloatArray, A: FloatArray) -> FloatArray:
     Also valid if A lies on the axis, where ``A``, ``ĤA`` and ``Ĥ²A`` span no circle.
     """
     pencil = np.linalg.svd(G)[0][:, 2:]
-    heights = A @ pencil
-    return np.asarray(pencil @ np.array([heights[1], -heights[0]]), dtype=np.float64)
+    scales = A @ pencil
+    return np.asarray(pencil @ np.array([scales[1], -scales[0]]), dtype=np.float64)
 
 
 def axis_points(G: FloatArray) -> FloatArray:
@@ -173,14 +173,14 @@ def two_general(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArr
     crossing determines one angle of joint 2. ``A``, ``target`` (4,) of equal heights; ``seed`` (2,).
     """
     if np.linalg.norm(G[1] @ A) <= FREE * np.linalg.norm(G[1]) * np.linalg.norm(A):
-        return beside(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
+        return append_joints(turn_between(G[0], A, target, seed[0]), single(seed[1], free=True))
     crossing = circle_meets_plane(-G[0], target, normal_plane(G[1], A), seed[0])
     found = []
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target
         first = single(float(angle), crossing.excess, crossing.free)
-        found.append(beside(first, turn_between(G[1], A, before, seed[1])))
-    return together(found)
+        found.append(append_joints(first, turn_between(G[1], A, before, seed[1])))
+    return concatenate(found)
 
 
 def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> Branches:
@@ -201,17 +201,17 @@ def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatAr
         return complex(x, y)
 
     opposite = (direction(G[1] @ e) / direction(e)).imag < 0.0
-    turning = -G[1] if opposite else G[1]
-    radial = -turning @ (turning @ A)
+    opposed = -G[1] if opposite else G[1]
+    radial = -opposed @ (opposed @ A)
     arm, between = direction(radial), direction(square @ (A - radial))
     required = direction(square @ target)
     size = max(abs(arm), abs(between), abs(required))
     if abs(between) <= FREE * size:
         whole = float(np.angle(required / arm)) if abs(arm) > FREE * size else 0.0
         second = single(_signed(whole - seed[0], opposite), free=True)
-        return beside(single(float(seed[0]), free=True), second)
+        return append_joints(single(float(seed[0]), free=True), second)
     if abs(arm) <= FREE * size:
-        return beside(single(float(np.angle(required / between))), single(float(seed[1]), free=True))
+        return append_joints(single(float(np.angle(required / between))), single(float(seed[1]), free=True))
     cosine = (abs(required) ** 2 - abs(between) ** 2 - abs(arm) ** 2) / (2.0 * abs(between) * abs(arm))
     bend = np.arctan2(np.sqrt(max(0.0, (1.0 - cosine) * (1.0 + cosine))), cosine)
     central = np.angle(between / arm)
@@ -221,10 +221,10 @@ def two_parallel(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatAr
         reach = between + np.exp(1j * turn) * arm
         second = single(_signed(float(turn), opposite), excess)
         if min(abs(reach), abs(required)) <= FREE * size:
-            found.append(beside(single(float(seed[0]), free=abs(required) <= FREE * size), second))
+            found.append(append_joints(single(float(seed[0]), free=abs(required) <= FREE * size), second))
         else:
-            found.append(beside(single(float(np.angle(required / reach))), second))
-    return together(found)
+            found.append(append_joints(single(float(np.angle(required / reach))), second))
+    return concatenate(found)
 
 
 def _signed(angle: float, opposite: bool) -> float:
@@ -242,8 +242,8 @@ def arm(G: FloatArray, A: FloatArray, target: FloatArray, seed: FloatArray) -> B
     for angle in crossing.angles:
         before = exp_rotation(G[0], -angle) @ target
         first = single(float(angle), crossing.excess, crossing.free)
-        found.append(beside(first, two_parallel(G[1:], A, before, seed[1:])))
-    return together(found)
+        found.append(append_joints(first, two_parallel(G[1:], A, before, seed[1:])))
+    return concatenate(found)
 
 
 def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
@@ -254,16 +254,16 @@ def wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
     """
     centre = common_point(G)
     ends = axis_points(G[2])
-    share = ends @ centre
-    A = np.array([share[1], -share[0]]) @ ends
+    along_axis = ends @ centre
+    A = np.array([along_axis[1], -along_axis[0]]) @ ends
     first_two = two_general(G[:2], A, H @ A, seed[:2])
     found = []
     for i, (first, second) in enumerate(first_two.steps):
         rest = exp_rotation(G[1], -second) @ exp_rotation(G[0], -first) @ H
         # The columns of the identity as points: rotated, they are the columns of the rotation.
         last = turn_between(G[2], np.eye(4), rest.T, seed[2])
-        found.append(beside(one_of(first_two, i), last))
-    return together(found)
+        found.append(append_joints(candidate(first_two, i), last))
+    return concatenate(found)
 
 
 def arm_with_wrist(G: FloatArray, H: FloatArray, seed: FloatArray) -> Branches:
@@ -296,5 +296,5 @@ def _with_wrist(
     for i, steps in enumerate(place.steps):
         moves = exponential(G[:3], steps)
         rotation = np.linalg.solve(moves[0] @ moves[1] @ moves[2], H)
-        found.append(beside(one_of(place, i), wrist(G[3:], rotation, seed[3:])))
-    return together(found)
+        found.append(append_joints(candidate(place, i), wrist(G[3:], rotation, seed[3:])))
+    return concatenate(found)

@@ -86,7 +86,7 @@ def all_solutions(
             best, least = ends[int(np.argmin(left))], float(left.min())
         for i in known.add(ends, left, 1):
             twins = _twins(chain, points, known.joints[i])
-            known.add(*descended(chain, points, targets, twins, damping=1e-6), 0)
+            known.add(*run_descent(chain, points, targets, twins, damping=1e-6), 0)
         if tried >= FEWEST and min(known.hits, default=HITS) >= HITS:
             break
     return np.array(known.joints).reshape(-1, chain.joints), np.array(known.residuals), best
@@ -98,13 +98,13 @@ def _along_valleys(
     """End points (s, n) and residuals (s,) of descents; those that ended in a valley are continued to its minimum. Near
     a singular configuration the residual is almost zero along a curve of joint positions, and steps along it are short.
     """
-    ends, left = descended(chain, points, targets, starts)
+    ends, left = run_descent(chain, points, targets, starts)
     slow = (left > tolerance) & (left <= VALLEY)
     for _ in range(VALLEY_ROUNDS):
         if not slow.any():
             break
         before = ends[slow]
-        ends[slow], left[slow] = descended(chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED)
+        ends[slow], left[slow] = run_descent(chain, points, targets, before, iterations=VALLEY_STEPS, damping=UNDAMPED)
         slow[slow] = (left[slow] > tolerance) & (np.abs(ends[slow] - before).max(axis=1) > CLOSE)
     return ends, left
 
@@ -153,7 +153,7 @@ class _Known:
         stays = False
         for _ in range(REFINEMENTS):
             before = q
-            ends, left = descended(self.chain, self.points, self.targets, q[None], damping=POLISH)
+            ends, left = run_descent(self.chain, self.points, self.targets, q[None], damping=POLISH)
             q = ends[0]
             stays = bool(np.abs(q - before).max() <= 0.1 * CLOSE)
             if stays:
@@ -192,7 +192,7 @@ def one_solution(
     As `all_solutions`: (s, n), residuals (s,), closest approach (n,); without duplicates.
     """
     starts = np.concatenate([seed[None], even_starts(chain, limits, count - 1)])
-    ends, left = descended(chain, points, targets, starts)
+    ends, left = run_descent(chain, points, targets, starts)
     best = ends[int(np.argmin(left))]
     solved = left <= tolerance
     kept = distinct(chain.kinds, ends[solved], CLOSE)
@@ -316,7 +316,7 @@ def descend(
         chain_forward_into(chain, q, H, operators)
         transform_points_into(H, points, moved)
         error = _squared_error(moved, targets)
-        share = damping0
+        damping = damping0
         for _ in range(iterations):
             if not error > 0.0:
                 break
@@ -325,8 +325,8 @@ def descend(
             trace = _normal_equations_into(rows, moved, targets, A, g)
             won = False
             small = False
-            while share < 1e8:
-                if _solve_damped(A, g, share * trace / n + IDLE * weight, L, step):
+            while damping < 1e8:
+                if _solve_damped(A, g, damping * trace / n + IDLE * weight, L, step):
                     longest = 0.0
                     for j in range(n):
                         longest = max(longest, abs(step[j]))
@@ -345,15 +345,15 @@ def descend(
                         break
                     if longest < 1e-14:
                         break
-                share = max(1e-15, 8.0 * share)
+                damping = max(1e-15, 8.0 * damping)
             if not won or small:
                 break
-            share = max(1e-15, 0.1 * share)
+            damping = max(1e-15, 0.1 * damping)
         errors[a] = error
     return ends, errors
 
 
-def descended(
+def run_descent(
     chain: ProjectiveChain,
     points: FloatArray,
     targets: FloatArray,

@@ -20,10 +20,10 @@ from stereoservo.kinematics.inverse.solver import inverse_kinematics
 from stereoservo.kinematics.joint_angles import JointAngles, refined_joints
 from stereoservo.kinematics.joint_reprojection import (
     JointAnglesError,
-    SeenChain,
+    ObservedChain,
     joint_problem,
-    points_seen,
-    seen_chain,
+    observed_chain,
+    reconstruct_points,
 )
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
@@ -63,8 +63,8 @@ def postures(
     ``recognition``: of this model, if known. Raises InverseKinematicsError for images that share fewer than three
     markers, or that no motion of this body explains; JointAnglesError.
     """
-    seen = seen_chain(model)
-    targets, _ = points_seen(seen, seen.chain.zero, pixels, sigma)
+    seen = observed_chain(model)
+    targets, _ = reconstruct_points(seen, seen.chain.zero, pixels, sigma)
     known = np.isfinite(targets).all(axis=1)
     if int(known.sum()) < FEWEST:
         raise InverseKinematicsError(
@@ -112,7 +112,7 @@ class ImageSolutions:
 
 
 def refined_on_images(
-    seen: SeenChain,
+    seen: ObservedChain,
     found: InverseSolutions,
     points: FloatArray,
     pixels: FloatArray,

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.kinematics.chain import ProjectiveChain
-from stereoservo.kinematics.covariance import propagated
+from stereoservo.kinematics.covariance import propagate_covariance
 from stereoservo.kinematics.inverse.solutions import Case
 from stereoservo.kinematics.model import CellModel
 from stereoservo.numerics.arrays import FloatArray
@@ -137,7 +137,7 @@ class _ConditionTest:
         deviation = float(np.linalg.norm(test(self.chain.generators[chosen])))
         if self.model is None or deviation > COARSEST:
             return Evidence(condition, joints, deviation <= EXACT, deviation)
-        values, covariance = propagated(self.model, lambda model: test(model.generators[chosen]))
+        values, covariance = propagate_covariance(self.model, lambda model: test(model.generators[chosen]))
         # More incidences than conditions: the additional ones vary only in second order.
         variances, vectors = np.linalg.eigh(covariance)
         variances, vectors = variances[-freedom:], vectors[:, -freedom:]
@@ -163,7 +163,7 @@ def recognise(arm: ProjectiveChain | CellModel) -> Recognition:
     return Recognition("numerical", False, tuple(judge.evidence.values()))
 
 
-def examined(arm: ProjectiveChain | CellModel, condition: Condition, joints: tuple[int, ...]) -> Evidence:
+def check_condition(arm: ProjectiveChain | CellModel, condition: Condition, joints: tuple[int, ...]) -> Evidence:
     """One condition on revolute ``joints``: two ``parallel``, two or more with a ``common_point``, or prismatic ones
     that are ``independent``.
     """
@@ -179,17 +179,17 @@ def structure(arm: ProjectiveChain | CellModel) -> tuple[Evidence, ...]:
     intersect in one point, which replace the pairs that they contain.
     """
     chain = chain_of(arm)
-    turning = [j for j in chain.order if chain.kinds[j] == "revolute"]
-    pairs = list(pairwise(turning))
-    parallel = [examined(arm, "parallel", pair) for pair in pairs]
-    alike = {told.joints for told in parallel if told.holds}
+    revolute = [j for j in chain.order if chain.kinds[j] == "revolute"]
+    pairs = list(pairwise(revolute))
+    parallel = [check_condition(arm, "parallel", pair) for pair in pairs]
+    alike = {tested.joints for tested in parallel if tested.holds}
     triples = [
-        three for three in zip(turning, turning[1:], turning[2:], strict=False) if not {three[:2], three[1:]} & alike
+        three for three in zip(revolute, revolute[1:], revolute[2:], strict=False) if not {three[:2], three[1:]} & alike
     ]
-    through = [told for three in triples if (told := examined(arm, "common_point", three)).holds]
-    told_of = {pair for told in through for pair in pairwise(told.joints)}
-    met = [examined(arm, "common_point", pair) for pair in pairs if pair not in alike | told_of]
-    return tuple(told for told in (*parallel, *through, *met) if told.holds)
+    through = [tested for three in triples if (tested := check_condition(arm, "common_point", three)).holds]
+    tested_pairs = {pair for tested in through for pair in pairwise(tested.joints)}
+    met = [check_condition(arm, "common_point", pair) for pair in pairs if pair not in alike | tested_pairs]
+    return tuple(tested for tested in (*parallel, *through, *met) if tested.holds)
 
 
 def chain_of(arm: ProjectiveChain | CellModel) -> ProjectiveChain:

@@ -85,8 +85,8 @@ def _stays_reached(
 ) -> bool:
     """Whether the goal is reached about ``step`` (n,) away from ``q`` (n,), and at half of it."""
     ahead, residual = corrected(chain, points, targets, q + step, tolerance)
-    share = float((ahead - q) @ step) / float(step @ step)
-    return residual <= STRICTER * tolerance and 0.5 < share < 1.5
+    fraction = float((ahead - q) @ step) / float(step @ step)
+    return residual <= STRICTER * tolerance and 0.5 < fraction < 1.5
 
 
 def nearest_by_self_motion(
@@ -115,7 +115,7 @@ def nearest_by_self_motion(
     return q
 
 
-def slid_inside(
+def moved_within_limits(
     chain: ProjectiveChain,
     points: FloatArray,
     targets: FloatArray,

@@ -100,8 +100,8 @@ SAME = 1e-6
 def nearest_turns(kinds: tuple[str, ...], joints: FloatArray, seed: FloatArray) -> FloatArray:
     """Joints (..., n) with revolute ones within half a turn of ``seed`` (n,)."""
     revolute = np.array([kind == "revolute" for kind in kinds])
-    turned = seed + np.mod(joints - seed + np.pi, 2.0 * np.pi) - np.pi
-    return np.asarray(np.where(revolute, turned, joints), dtype=np.float64)
+    wrapped = seed + np.mod(joints - seed + np.pi, 2.0 * np.pi) - np.pi
+    return np.asarray(np.where(revolute, wrapped, joints), dtype=np.float64)
 
 
 def within_limits(

@@ -19,21 +19,21 @@ from stereoservo.kinematics.inverse.closed_forms import (
     Branches,
     arm,
     arm_with_wrist,
+    concatenate,
     gantry_with_wrist,
     prismatic_joints,
-    together,
     turn_between,
     two_general,
     two_parallel,
     wrist,
 )
-from stereoservo.kinematics.inverse.numerical import POLISH, descended, equivalent_points, linearised
+from stereoservo.kinematics.inverse.numerical import POLISH, equivalent_points, linearised, run_descent
 from stereoservo.kinematics.inverse.recognition import Recognition, chain_of, recognise
 from stereoservo.kinematics.inverse.self_motion import (
     NO_MOTION,
+    moved_within_limits,
     nearest_by_self_motion,
     self_motions,
-    slid_inside,
 )
 from stereoservo.kinematics.inverse.solutions import (
     Case,
@@ -112,7 +112,7 @@ def inverse_kinematics(
     if branches is None:
         return _searched(problem)
     starts = chain.zero + branches.steps
-    ends, left = descended(chain, problem.points, problem.targets, starts, damping=POLISH)
+    ends, left = run_descent(chain, problem.points, problem.targets, starts, damping=POLISH)
     solved = left <= tolerance
     if not solved.any():
         return _unreachable(problem, known, ends, left, branches)
@@ -197,7 +197,7 @@ def _candidates(
         return turn_between(G[0], points, targets, float(seed[0]))
     if case in SINGLE_POINT:
         pairs = zip(points[:WITNESSES], targets[:WITNESSES], strict=True)
-        return together([SINGLE_POINT[case](G, A, goal, seed) for A, goal in pairs])
+        return concatenate([SINGLE_POINT[case](G, A, goal, seed) for A, goal in pairs])
     if case in WHOLE_ROTATION and H is not None:
         return WHOLE_ROTATION[case](G, H, seed)
     return None
@@ -217,11 +217,11 @@ def _searched(problem: _Problem) -> InverseSolutions:
         seed=problem.seed,
     )
     if not len(ends):
-        residual = float(descended(chain, problem.points, problem.targets, best[None], iterations=0)[1][0])
+        residual = float(run_descent(chain, problem.points, problem.targets, best[None], iterations=0)[1][0])
         return _nothing(problem, "numerical", Shortfall(best, residual, None, None))
     if rank < chain.joints:
         ends = np.array([_settled(problem, q) for q in _representatives(problem, ends)])
-        ends, left = descended(chain, problem.points, problem.targets, ends, damping=POLISH)
+        ends, left = run_descent(chain, problem.points, problem.targets, ends, damping=POLISH)
     return _answer(problem, "numerical", ends, left)
 
 
@@ -237,9 +237,9 @@ def _rank(problem: _Problem) -> int:
 
 def _representatives(problem: _Problem, ends: FloatArray) -> FloatArray:
     """Point of a continuum (s, n) nearest to the seed; with limits, the first few."""
-    turned = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
-    order = np.argsort(np.linalg.norm(turned - problem.seed, axis=1), kind="stable")
-    return turned[order[: 1 if problem.limits is None else 8]]
+    wrapped = np.array([within_limits(problem.chain.kinds, q, problem.seed, problem.limits)[0] for q in ends])
+    order = np.argsort(np.linalg.norm(wrapped - problem.seed, axis=1), kind="stable")
+    return wrapped[order[: 1 if problem.limits is None else 8]]
 
 
 def _settled(problem: _Problem, q: FloatArray) -> FloatArray:
@@ -257,7 +257,7 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
         q, fits = within_limits(chain.kinds, joints[i], problem.seed, problem.limits)
         motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
         if not fits and len(motions) == 1 and problem.limits is not None:
-            slid = slid_inside(chain, problem.points, problem.targets, q, problem.limits, problem.tolerance)
+            slid = moved_within_limits(chain, problem.points, problem.targets, q, problem.limits, problem.tolerance)
             if slid is not None:
                 q, fits = slid, True
                 motions = self_motions(chain, problem.points, problem.targets, q, problem.tolerance)
@@ -268,7 +268,7 @@ def _answer(problem: _Problem, case: Case, joints: FloatArray, left: FloatArray)
     inside.sort(key=lambda solution: float(np.linalg.norm(solution[0] - problem.seed)))
     n = chain.joints
     rows = np.array([q for q, _, _ in inside]).reshape(-1, n)
-    residuals = descended(chain, problem.points, problem.targets, rows, iterations=0)[1]
+    residuals = run_descent(chain, problem.points, problem.targets, rows, iterations=0)[1]
     motions_of = tuple(motions for _, _, motions in inside)
     return InverseSolutions(
         case,
@@ -349,10 +349,10 @@ def clear_plane(planes: FloatArray, points: FloatArray) -> FloatArray:
     """Plane (4,) of the span of ``planes`` (k, 4) that is farthest from all ``points`` (m, 4)."""
     if len(planes) == 1:
         return np.asarray(planes[0], dtype=np.float64)
-    heights = planes @ (points / np.linalg.norm(points, axis=1, keepdims=True)).T
+    scales = planes @ (points / np.linalg.norm(points, axis=1, keepdims=True)).T
     candidates = np.random.default_rng(0).normal(size=(CANDIDATES, len(planes)))
     candidates /= np.linalg.norm(candidates, axis=1, keepdims=True)
-    clearest = int(np.argmax(np.abs(candidates @ heights).min(axis=1)))
+    clearest = int(np.argmax(np.abs(candidates @ scales).min(axis=1)))
     return np.asarray(candidates[clearest] @ planes, dtype=np.float64)
 
 
@@ -445,7 +445,7 @@ def displacement_between(
     best, least = np.eye(4), np.inf
     for start in range(STARTS):
         try:
-            first = np.eye(4) if start == 0 else _turned(algebra, rng)
+            first = np.eye(4) if start == 0 else _random_displacement(algebra, rng)
             H, residual = _fitted(algebra, points, targets, first)
         except GeometryError:  # not a rigid motion by its eigenvalues: another start may succeed
             continue
@@ -463,7 +463,7 @@ def displacement_between(
     )
 
 
-def _turned(algebra: FloatArray, rng: np.random.Generator) -> FloatArray:
+def _random_displacement(algebra: FloatArray, rng: np.random.Generator) -> FloatArray:
     """Random displacement of about half a turn, as a start value."""
     X = np.tensordot(rng.normal(size=len(algebra)), algebra, axes=1)
     squared = -0.5 * float(np.sum(X * X.T))

@@ -31,11 +31,11 @@ from stereoservo.web.cell_link import Publish, picture_message
 from stereoservo.web.model_view import ModelView, no_goal
 
 TICK_S = 0.02
-TELL_EVERY_S = 0.2
+PUBLISH_EVERY_S = 0.2
 EVENTS_SHOWN = 100
 
 
-class FlightLink:
+class PlaybackLink:
     """Plays the recording ``path`` to pages, from its beginning, while it is still being read.
 
     All pages show the same time. Raises RecordingError if it cannot be read.
@@ -52,7 +52,7 @@ class FlightLink:
         self.cell = path.name
         self.view = ModelView()
         self._timeline = Timeline()
-        self._reader = FlightReader(path, self._span, self._timeline)
+        self._reader = PlaybackReader(path, self._span, self._timeline)
         self._lock = threading.Lock()
         self._at_ns = self._span.first_ns
         self._playing, self._speed = True, 1.0
@@ -98,8 +98,8 @@ class FlightLink:
     def seek(self, seconds: float) -> dict[str, Any]:
         """Seek to a time [s] after the recording's beginning, at most to the last step read so far."""
         with self._lock:
-            wanted = self._span.first_ns + round(seconds * 1e9)
-            self._at_ns = min(max(wanted, self._span.first_ns), self._read_ns())
+            target_ns = self._span.first_ns + round(seconds * 1e9)
+            self._at_ns = min(max(target_ns, self._span.first_ns), self._read_ns())
             self._jumped = True
             return {"message": f"at {self._seconds(self._at_ns):.2f} s"}
 
@@ -111,8 +111,8 @@ class FlightLink:
 
     def _show(self) -> None:
         shown: dict[str, int] = {}
-        told = b""
-        told_at = last = time.monotonic()
+        published = b""
+        published_at = last = time.monotonic()
         while not self._ended.wait(TICK_S):
             now = time.monotonic()
             at_ns, jumped = self._advance(now - last)
@@ -122,11 +122,11 @@ class FlightLink:
                 jumped = True
             if jumped:
                 shown.clear()
-                self._tell("plots", {"plots": self._timeline.plots(at_ns)})
+                self._publish_slot("plots", {"plots": self._timeline.plots(at_ns)})
             self._show_moment(at_ns, shown)
             state = msgspec.json.encode({"flight": self._flight(at_ns)})
-            if state != told and (jumped or now - told_at >= TELL_EVERY_S):
-                told, told_at = state, now
+            if state != published and (jumped or now - published_at >= PUBLISH_EVERY_S):
+                published, published_at = state, now
                 self._publish("flight", state, True)
 
     def _advance(self, seconds: float) -> tuple[int, bool]:
@@ -154,7 +154,7 @@ class FlightLink:
             count = shown["events"] = shown.get("event", 0)
             first = max(0, count - EVENTS_SHOWN)
             events = [msgspec.Raw(self._timeline.message("event", k)) for k in range(first, count)]
-            self._tell("events", {"events": events})
+            self._publish_slot("events", {"events": events})
 
     def _flight(self, at_ns: int) -> dict[str, Any]:
         with self._lock:
@@ -170,7 +170,7 @@ class FlightLink:
                 "notes": self._reader.notes,
             }
 
-    def _tell(self, slot: str, tree: dict[str, Any]) -> None:
+    def _publish_slot(self, slot: str, tree: dict[str, Any]) -> None:
         self._publish(slot, msgspec.json.encode(tree), True)
 
 
@@ -256,7 +256,7 @@ def _time_of(row: tuple[float | None, ...]) -> float:
     return row[0]
 
 
-class FlightReader:
+class PlaybackReader:
     """Fills a ``timeline`` with a recording of a cell with these ``span``: replays it, and reads its pictures."""
 
     def __init__(self, path: Path, span: RecordedSpan, timeline: Timeline) -> None:
@@ -282,7 +282,7 @@ class FlightReader:
         """Read the recording, to its end or to where it is damaged; `notes` then report that."""
         self._open_videos()
         try:
-            result = replay(self._path, observe=self._take, header=self._begin)
+            result = replay(self._path, observe=self._on_step, header=self._begin)
             if result.identical is False:
                 self.notes.append(
                     f"The replay differs from the recording at step {result.first_difference}: joints and markers are "
@@ -315,10 +315,10 @@ class FlightReader:
             },
             RunRecord,
         )
-        self._tell("info", self._span.first_ns, {"info": self._info})
-        self._tell("goal", self._span.first_ns, no_goal())
+        self._publish_slot("info", self._span.first_ns, {"info": self._info})
+        self._publish_slot("goal", self._span.first_ns, no_goal())
 
-    def _take(self, inputs: StepInputs, outputs: StepOutputs) -> None:
+    def _on_step(self, inputs: StepInputs, outputs: StepOutputs) -> None:
         if self.ended.is_set():
             raise _EndedError
         now_ns, status = inputs.now_ns, outputs.status
@@ -328,21 +328,21 @@ class FlightReader:
         if inputs.model_update is not None:
             self._models[inputs.model_update.model.epoch] = inputs.model_update.model
         self._joints_ns, self._frames_ns = newest_stamps(inputs, self._joints_ns, self._frames_ns)
-        self._take_goals(inputs, outputs)
+        self._on_goals(inputs, outputs)
         for event in outputs.events:
             if event.kind != "reply":
-                self._tell("event", now_ns, {"event": self._event(event)})
+                self._publish_slot("event", now_ns, {"event": self._event(event)})
         for seen in inputs.observations:
-            self._take_features(now_ns, seen)
-        self._take_pictures(now_ns)
+            self._on_features(now_ns, seen)
+        self._on_pictures(now_ns)
         if now_ns - self._state_ns >= STATE_EVERY_NS:
             self._state_ns = now_ns
-            self._take_state(inputs, status)
+            self._on_state(inputs, status)
         self._timeline.read_ns = now_ns
 
-    def _take_goals(self, inputs: StepInputs, outputs: StepOutputs) -> None:
+    def _on_goals(self, inputs: StepInputs, outputs: StepOutputs) -> None:
         """Goals that are sent, planned and moved, drawn from their start on."""
-        told = ""
+        goal_id = ""
         for request in inputs.requests:
             command = request.command
             if isinstance(command, RunGoal) and not command.goal.check:
@@ -351,7 +351,7 @@ class FlightReader:
             elif isinstance(command, UpdateGoal) and command.id in self._goals:
                 goal, plan = self._goals[command.id]
                 self._goals[command.id] = (msgspec.structs.replace(goal, target=command.target), plan)
-                told = command.id
+                goal_id = command.id
         for event in outputs.events:
             if event.kind == "reply" and event.request in self._requests:
                 id_ = self._requests.pop(event.request)
@@ -360,22 +360,22 @@ class FlightReader:
                 else:
                     del self._goals[id_]
             elif event.kind == "goal_started":
-                told = event.id
+                goal_id = event.id
             elif event.kind in TERMINAL:
                 self._goals.pop(event.id, None)
-        if outputs.status.goal == told and told in self._goals:
-            self._tell("goal", inputs.now_ns, self._view.goal(*self._goals[told]))
+        if outputs.status.goal == goal_id and goal_id in self._goals:
+            self._publish_slot("goal", inputs.now_ns, self._view.goal(*self._goals[goal_id]))
 
     def _event(self, event: Event) -> EventMessage:
         t_wall = (event.t_ns + self._span.shift_ns) * 1e-9
         return EventMessage(event.seq, "", event.t_ns, t_wall, event.kind, **core_event_fields(event))
 
-    def _take_features(self, now_ns: int, seen: CameraObservation) -> None:
+    def _on_features(self, now_ns: int, seen: CameraObservation) -> None:
         if np.isfinite(seen.pixels).all() and np.isfinite(seen.covariances).all():
             found = features_message(seen, self._span.shift_ns)
-            self._tell(f"features {seen.camera}", now_ns, {"features": found})
+            self._publish_slot(f"features {seen.camera}", now_ns, {"features": found})
 
-    def _take_pictures(self, now_ns: int) -> None:
+    def _on_pictures(self, now_ns: int) -> None:
         for video in list(self._videos):
             try:
                 frame = video.newest(now_ns)
@@ -390,7 +390,7 @@ class FlightReader:
                 data = picture_message(encode(info), encode_jpeg(frame.image))
                 self._timeline.add(f"picture {frame.camera}", now_ns, data)
 
-    def _take_state(self, inputs: StepInputs, status: Status) -> None:
+    def _on_state(self, inputs: StepInputs, status: Status) -> None:
         assert self._run is not None
         assert self._info is not None
         if status.model_epoch != self._epoch:
@@ -407,12 +407,12 @@ class FlightReader:
             state_message(self._run, "", state, now_ns=inputs.now_ns, servo_alive=True, last_event=0),
             t_wall=(status.t_ns + self._span.shift_ns) * 1e-9,
         )
-        self._tell("state", inputs.now_ns, {"state": message, **self._view.at(message)})
+        self._publish_slot("state", inputs.now_ns, {"state": message, **self._view.at(message)})
         codes = tuple(reason.code for reason in status.reasons)
         velocities = [message.velocities.get(joint.name) for joint in self._info.joints]
         self._timeline.add_row(inputs.now_ns, message.error_px, p99, velocities, codes)
 
-    def _tell(self, slot: str, t_ns: int, tree: dict[str, Any]) -> None:
+    def _publish_slot(self, slot: str, t_ns: int, tree: dict[str, Any]) -> None:
         self._timeline.add(slot, t_ns, msgspec.json.encode(tree))
 
 

@@ -1,4 +1,4 @@
-"""What of a body has to stay in sight: faces of plates and bodies, one camera, lenses, margins that yield to ends."""
+"""Visibility constraints: faces of plates and bodies, one camera, lenses, margins that yield to the ends."""
 
 import msgspec
 import numpy as np
@@ -20,7 +20,7 @@ def cube_request(virtual, cells, rng, T0, T_star, faces):
     world = virtual.free_arm(rng, T0)
     return world, cells.request(
         world, T_star,
-        points=world.hidden(CUBE @ T0.T), targets=world.hidden(CUBE @ T_star.T), kept=np.ones(8),
+        points=world.hidden(CUBE @ T0.T), targets=world.hidden(CUBE @ T_star.T), must_stay_visible=np.ones(8),
         faces=np.array([SIDES[name][0] for name in faces]),
     )  # fmt: skip
 
@@ -61,7 +61,7 @@ def test_a_side_that_turns_away_is_no_hindrance_where_another_is_kept(virtual, c
     lost = "+x" if sees(world, T0, "+x").any() else "-x"
     _, request = cube_request(virtual, cells, rng, T0, T_star, [lost])
     failure = start_planning(request).failure[0]
-    assert (failure.what, failure.share) == ("FACE_HIDDEN", 1.0)
+    assert (failure.kind, failure.path_parameter) == ("FACE_HIDDEN", 1.0)
 
 
 def test_one_camera_is_enough(virtual, cells):
@@ -76,7 +76,7 @@ def test_one_camera_is_enough(virtual, cells):
     found = plan(one).plan
     assert found is not None
     np.testing.assert_allclose(world.markers(found.joints[-1]), virtual.PLATE @ T_star.T, atol=1e-5)
-    assert {approach.index for approach in found.approaches if approach.what == "FIELD_OF_VIEW"} == {0}
+    assert {approach.index for approach in found.approaches if approach.kind == "FIELD_OF_VIEW"} == {0}
 
 
 def test_images_are_those_behind_the_lens(virtual, cells):
@@ -86,13 +86,13 @@ def test_images_are_those_behind_the_lens(virtual, cells):
     lenses = np.array([[-0.15, 322.0, 238.0, 320.0], [0.1, 318.0, 241.0, 320.0]])
     found = plan(cells.request(world, T_star, limits={"lenses": lenses})).plan
     assert found is not None
-    rooms = []
+    clearances = []
     for q in found.joints:
         raw = np.array([distort(k, uv) for k, uv in zip(lenses, world.pixels(world.markers(q)), strict=True)])
-        rooms.append(np.minimum(raw + 0.5, cells.SIZES[:, None] - 0.5 - raw).min())
-    told = {approach.what: approach for approach in found.approaches}["FIELD_OF_VIEW"]
-    assert told.value == pytest.approx(min(rooms), abs=1e-3)
-    assert told.share == pytest.approx(int(np.argmin(rooms)) / 64)
+        clearances.append(np.minimum(raw + 0.5, cells.SIZES[:, None] - 0.5 - raw).min())
+    closest = {approach.kind: approach for approach in found.approaches}["FIELD_OF_VIEW"]
+    assert closest.value == pytest.approx(min(clearances), abs=1e-3)
+    assert closest.path_parameter == pytest.approx(int(np.argmin(clearances)) / 64)
 
 
 def test_a_goal_within_the_margin_is_arrived_at_and_left_again(virtual, cells):
@@ -102,8 +102,8 @@ def test_a_goal_within_the_margin_is_arrived_at_and_left_again(virtual, cells):
     low, high = 0.0, 0.4
     for _ in range(40):  # 2 px from a border, where 8 px are kept
         near[1, 3] = 0.5 * (low + high)
-        room, _ = cells.rooms_of(virtual.free_arm(rng, near), near)
-        low, high = (near[1, 3], high) if room > 2.0 else (low, near[1, 3])
+        clearance, _ = cells.clearances_of(virtual.free_arm(rng, near), near)
+        low, high = (near[1, 3], high) if clearance > 2.0 else (low, near[1, 3])
     for T0, T_star in ((inside, near), (near, inside)):
         world = virtual.free_arm(rng, T0)
         assert plan(cells.request(world, T_star, limits={"view_margin_px": 8.0})).plan is not None

@@ -18,7 +18,7 @@ from stereoservo.recording.replay import RecordingError
 
 pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
 
-from stereoservo.web.flight_link import FlightLink
+from stereoservo.web.playback import PlaybackLink
 
 STEPS = 400
 
@@ -26,7 +26,7 @@ STEPS = 400
 class Shown(NamedTuple):
     """A link that is paused, what it has published by slot, and what was recorded."""
 
-    link: FlightLink
+    link: PlaybackLink
     slots: dict[str, bytes]
     bench: Bench
     target: FeatureTarget
@@ -54,7 +54,7 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shown]:
     path = tmp_path_factory.mktemp("flight") / "flight.mcap"
     bench, target = record_bench(path, STEPS)
     slots: dict[str, bytes] = {}
-    link = FlightLink(path, lambda slot, data, keep: slots.__setitem__(slot, data))
+    link = PlaybackLink(path, lambda slot, data, keep: slots.__setitem__(slot, data))
     link.start()
     link.play(False, None)
 
@@ -88,7 +88,7 @@ def test_a_moment_is_what_was_recorded(shown: Shown) -> None:
         assert reasons[-1] == [rows[-1][0], [reason["code"] for reason in state["reasons"]]]
 
 
-def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
+def test_the_goal_is_drawn_and_reported_from_when_it_ran(shown: Shown) -> None:
     before, after = shown.at(GOAL_STEP - 1), shown.at(STEPS - 1)
     assert before["goal"]["goal"]["id"] == ""
     assert after["goal"]["goal"]["id"] == GOAL_ID
@@ -105,7 +105,7 @@ def test_the_goal_is_drawn_and_told_from_when_it_ran(shown: Shown) -> None:
     assert "goal_started" not in [event["event"]["kind"] for event in before["events"]["events"]]
 
 
-def test_it_plays_to_its_end_and_begins_anew(shown: Shown) -> None:
+def test_it_plays_to_its_end_and_begins_again(shown: Shown) -> None:
     shown.at(100)
     shown.link.play(True, 50.0)
 
@@ -123,4 +123,4 @@ def test_what_is_no_recording_is_refused_at_the_start(tmp_path: Path) -> None:
     path = tmp_path / "flight.mcap"
     path.write_bytes(b"no recording")
     with pytest.raises(RecordingError):
-        FlightLink(path, lambda slot, data, keep: None)
+        PlaybackLink(path, lambda slot, data, keep: None)
