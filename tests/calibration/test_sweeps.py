@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from stereoservo.calibration.sweeps import Leg, leg_means, stamp_delays
+from stereoservo.calibration.sweeps import Leg, leg_means, sweep_timing
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo_sim.world.random_cells import random_case
 from stereoservo_sim.world.synthetic import SyntheticCell
@@ -49,7 +49,19 @@ def legs_of(cell: SyntheticCell, rng: np.random.Generator, delays: FloatArray, p
                 stamps.append(stamped)
                 pixels.append(exact + rng.normal(0.0, SIGMA, exact.shape))
             variances = tuple(np.full(p.shape[:2], SIGMA**2) for p in pixels)
-            legs.append(Leg(joint, begin, begin + seconds, times, positions, tuple(stamps), tuple(pixels), variances))
+            legs.append(
+                Leg(
+                    joint,
+                    begin,
+                    begin + seconds,
+                    times,
+                    positions,
+                    tuple(stamps),
+                    tuple(pixels),
+                    variances,
+                    np.zeros(len(cell.home)),
+                )
+            )
             begin += seconds
     return legs
 
@@ -85,10 +97,13 @@ def test_means_have_the_noise_of_as_many_frames_at_rest(seed: int) -> None:
 def test_delays_are_found_with_their_deviation(seed: int, play: float) -> None:
     cell = random_case(seed).cell
     delays = np.random.default_rng([seed, 2]).uniform(-0.08, 0.08, 2)
-    found, deviations = stamp_delays(legs_of(cell, np.random.default_rng([seed, 3]), delays, play), 2)
-    print(f"seed {seed}, play {play}: errors {1e6 * (found - delays)} us, deviations {1e6 * deviations} us")
-    assert (np.abs(found - delays) < 5.0 * deviations + 2e-5).all()
-    assert (deviations < 2e-3).all()
+    found = sweep_timing(legs_of(cell, np.random.default_rng([seed, 3]), delays, play), 2)
+    errors = np.concatenate([found.delays - delays, found.play - play])
+    print(f"seed {seed}, play {play}: errors {1e6 * errors}, deviations {1e6 * found.deviations} [us, urad]")
+    used = np.abs(errors) < 5.0 * found.deviations + 2e-5
+    assert (used | (found.play[np.arange(8) - 2] == 0.0)).all() if play else used.all()
+    assert (found.deviations[:2] < 1e-3).all()
+    assert ((found.play > 0.0) == (play > 0.0)).mean() > 0.6
 
 
 def test_wrong_detections_do_not_enter_means() -> None:
@@ -113,6 +128,6 @@ def test_a_leg_without_motion_or_with_few_frames_has_no_means() -> None:
         variances=tuple(v[:5] for v in leg.variances),
     )  # fmt: skip
     assert leg_means(few, np.zeros(2), 4) is None
-    found, deviations = stamp_delays([few], 2)
-    assert (found == 0.0).all()
-    assert np.isinf(deviations).all()
+    found = sweep_timing([few], 2)
+    assert (found.delays == 0.0).all()
+    assert np.isinf(found.deviations).all()

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.stats import f as f_distribution
 
 from stereoservo.calibration.trial_data import finite_rows
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
@@ -29,15 +28,15 @@ FAR_SIGMAS = 6.0
 """Residual of an observation, in robust deviations of its track, above which it is a wrong detection."""
 LINE = 0.5, 0.95
 """Fractions of a leg's time at which it is on its line: it begins before the one before has ended."""
+LEAST_MOTION = 2e-3
+"""Motion of a joint [rad or m] on a leg from which its play is taken up."""
 STRAIGHT = 1e-3
 """Largest deviation of a joint from a leg's line, as a fraction of half the leg, in a frame that is used."""
 ROUNDS = 12
 LONGEST_DELAY_S = 0.3
-CONVERGED_S = 1e-6
-PLAY_TERMS = 3
-"""Number of polynomial terms of the displacement by direction."""
-FALSE_ALARM = 1e-3
-"""Probability of finding play in joints that have none."""
+CONVERGED = 1e-6
+SIGNIFICANT = 6.0
+"""Play, in its standard deviations, from which it is taken into account."""
 STILL, MOST_OTHERS = 1e-6, 3
 """Motion of other joints [rad or m, rms] that is taken into account, and most directions of it."""
 DELAY_TERMS = 10
@@ -49,7 +48,8 @@ FEWEST_FRAMES = 12
 class Leg(msgspec.Struct, frozen=True, eq=False):
     """Observations on one leg, from ``start_s`` to ``end_s``. ``trial``: the joint that moves alone, -1 if several do.
 
-    Joint samples, before and after the leg as well: ``joint_times`` (j,) [s], ``positions`` (j, n). For each camera its
+    Joint samples, before and after the leg as well: ``joint_times`` (j,) [s], ``positions`` (j, n); the readings are
+    exact to ``resolution`` (n,). For each camera its
     frames: ``times`` (f,) [s] as stamped, ``pixels`` (f, m, 2) raw, NaN where a marker is not seen, ``variances``
     (f, m) [px²] of a coordinate, as stated.
     """
@@ -62,6 +62,7 @@ class Leg(msgspec.Struct, frozen=True, eq=False):
     times: tuple[FloatArray, ...]
     pixels: tuple[FloatArray, ...]
     variances: tuple[FloatArray, ...]
+    resolution: FloatArray
 
     def positions_at(self, times: FloatArray) -> FloatArray:
         """Joint positions (f, n) at ``times`` (f,) [s], by linear interpolation."""
@@ -100,7 +101,7 @@ def leg_means(leg: Leg, delays: FloatArray, frames_each: int) -> LegMeans | None
     if not line.any():
         return None
     along = [(q - middle) @ line / (line @ line) for q in shown]
-    straight = [_near_line(q - middle, a, line) for q, a in zip(shown, along, strict=True)]
+    straight = [_near_line(q - middle, a, line, leg.resolution) for q, a in zip(shown, along, strict=True)]
     most = max((a[near] for a, near in zip(along, straight, strict=True)), key=len)
     if len(most) < max(frames_each, FEWEST_FRAMES_OF_LEG):
         return None
@@ -132,10 +133,22 @@ def leg_means(leg: Leg, delays: FloatArray, frames_each: int) -> LegMeans | None
     return LegMeans(positions, pixels, counts, single, frames, scatter, freedom)
 
 
-def _near_line(offsets: FloatArray, along: FloatArray, line: FloatArray) -> BoolArray:
+def links_displaced(legs: list[Leg], play: FloatArray) -> list[FloatArray]:
+    """For each leg, by how much (n,) the links are displaced from their readings by ``play`` (n,): half of it, against
+    the direction in which each joint has moved last.
+    """
+    side, found = np.zeros_like(play), []
+    for leg in legs:
+        moved = np.diff(leg.ends, axis=0)[0]
+        side = np.where(np.abs(moved) > np.maximum(play, LEAST_MOTION), np.sign(moved), side)
+        found.append(-0.5 * play * side)
+    return found
+
+
+def _near_line(offsets: FloatArray, along: FloatArray, line: FloatArray, resolution: FloatArray) -> BoolArray:
     """Mask (f,) of joint positions near a leg's line."""
-    aside = np.abs(offsets - along[:, None] * line).max(axis=1)
-    return np.asarray(aside <= STRAIGHT * np.abs(line).max())
+    aside = np.abs(offsets - along[:, None] * line)
+    return np.asarray((aside <= STRAIGHT * np.abs(line).max() + resolution).all(axis=1))
 
 
 class _Track(NamedTuple):
@@ -211,96 +224,114 @@ def _track(along: FloatArray, pixels: FloatArray, seen: BoolArray, terms: int) -
         used[np.flatnonzero(used)[wrong]] = False
 
 
-def stamp_delays(legs: list[Leg], cameras: int) -> tuple[FloatArray, FloatArray]:
-    """Delay (c,) [s] of the cameras' shutters after their stamps, by legs on which a joint moves alone, there and back,
-    and its standard deviation (c,); 0 and infinite where these do not determine it.
+class SweepTiming(NamedTuple):
+    """Delays (c,) [s] of the cameras' shutters after their stamps, and play (n,) [rad or m] of the joints, by which
+    links follow their readings, with their standard ``deviations`` (c + n,); 0 and infinite where sweeps do not
+    determine them.
     """
-    pairs = [[leg for leg in legs if leg.trial == joint] for joint in sorted({leg.trial for leg in legs} - {-1})]
-    exact = [_fitted_delay(pairs, camera, 0.0, play=False) for camera in range(cameras)]
-    play = [_fitted_delay(pairs, camera, one.delay, play=True) for camera, one in enumerate(exact)]
-    chosen = play if _plays(exact, play) else exact
-    return np.array([one.delay for one in chosen]), np.array([one.deviation for one in chosen])
+
+    delays: FloatArray
+    play: FloatArray
+    deviations: FloatArray
 
 
-class _Delay(NamedTuple):
-    """A delay [s] and its standard deviation, the sum of ``squares`` that it leaves, and degrees of ``freedom``."""
+def sweep_timing(legs: list[Leg], cameras: int) -> SweepTiming:
+    """Delays and play from the legs on which a joint sweeps alone, there and back. Play that is not significant is 0:
+    beside it the delays are known less.
+    """
+    joints = legs[0].positions.shape[1] if legs else 0
+    alone = [[leg for leg in legs if leg.trial == joint] for joint in range(joints)]
+    free = np.arange(cameras + joints) < cameras
+    values, deviations = np.zeros(cameras + joints), np.full(cameras + joints, np.inf)
+    for plays in (False, True, False):
+        if plays:
+            free[:] = True
+        values, deviations = _solved_timing(alone, cameras, np.where(free, values, 0.0), free)
+        free = (np.arange(len(values)) < cameras) | (np.abs(values) > SIGNIFICANT * deviations)
+    return SweepTiming(values[:cameras], values[cameras:], deviations)
 
-    delay: float
-    deviation: float
+
+def _solved_timing(
+    alone: list[list[Leg]], cameras: int, values: FloatArray, free: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Delays and play, of which those that are not ``free`` keep their ``values``, and their deviations."""
+    for _ in range(ROUNDS):
+        square, across = np.zeros((len(values), len(values))), np.zeros(len(values))
+        squares = freedom = 0.0
+        for joint, legs in enumerate(alone):
+            for camera in range(cameras):
+                at = np.array([camera, cameras + joint])
+                one = _timing_equation(legs, camera, float(values[camera]), float(values[cameras + joint]))
+                square[np.ix_(at, at)] += one.square
+                across[at] += one.across
+                squares, freedom = squares + one.squares, freedom + one.freedom
+        known = free & (np.diag(square) > 0.0)
+        deviations = np.full(len(values), np.inf)
+        if not known.any() or freedom <= 1.0:
+            return np.zeros(len(values)), deviations
+        covariance = np.linalg.pinv(square[np.ix_(known, known)])
+        step = covariance @ across[known]
+        left = max(squares - float(across[known] @ step), 0.0)
+        deviations[known] = np.sqrt(np.diag(covariance) * left / freedom)
+        values = values.copy()
+        values[known] += step
+        values = np.clip(values, -LONGEST_DELAY_S, LONGEST_DELAY_S)
+        if np.abs(step).max() < CONVERGED:
+            break
+    return values, deviations
+
+
+class _Equation(NamedTuple):
+    """Normal equation of a delay and a play: ``square`` (2, 2), right side ``across`` (2,), the sum of ``squares`` that
+    they leave as they are, and its degrees of ``freedom``.
+    """
+
+    square: FloatArray
+    across: FloatArray
     squares: float
     freedom: float
 
 
-def _plays(exact: list[_Delay], play: list[_Delay]) -> bool:
-    """Whether joints with play explain the tracks of all cameras better than exact ones: play and delay are similar
-    where the speed is constant.
+def _timing_equation(legs: list[Leg], camera: int, delay: float, play: float) -> _Equation:
+    """Equation of changes of ``delay`` and ``play`` by the legs of one joint: a camera's tracks are polynomials of the
+    link's position.
     """
-    both = [(one, other) for one, other in zip(exact, play, strict=True) if np.isfinite(other.deviation)]
-    more = sum(one.freedom - other.freedom for one, other in both)
-    if more <= 0.0:
-        return False
-    left, freedom = sum(other.squares for _, other in both), sum(other.freedom for _, other in both)
-    ratio = (sum(one.squares for one, _ in both) - left) / more / max(left / freedom, 1e-300)
-    return bool(ratio > float(f_distribution.isf(FALSE_ALARM, more, freedom)))
-
-
-def _fitted_delay(pairs: list[list[Leg]], camera: int, start: float, *, play: bool) -> _Delay:
-    found = _Delay(start, np.inf, 0.0, 0.0)
-    for _ in range(ROUNDS):
-        equations = [_delay_equation(legs, camera, found.delay, play=play) for legs in pairs]
-        across, square, squares, freedom = (sum(one[k] for one in equations) for k in range(4))
-        if not square > 0.0 or freedom <= 1.0:
-            return _Delay(0.0, np.inf, 0.0, 0.0)
-        step = across / square
-        delay = float(np.clip(found.delay + step, -LONGEST_DELAY_S, LONGEST_DELAY_S))
-        left = max(squares - across * step, 0.0)
-        found = _Delay(delay, float(np.sqrt(left / freedom / square)), left, freedom)
-        if abs(step) < CONVERGED_S:
-            break
-    return found
-
-
-def _delay_equation(legs: list[Leg], camera: int, delay: float, *, play: bool) -> tuple[float, float, float, float]:
-    """Normal equation of a further delay from the legs of one joint: right side, square, sum of squared residuals at
-    ``delay``, and degrees of freedom. Tracks are polynomials of the joint; ``play``: displaced by its direction.
-    """
-    times = [leg.times[camera] for leg in legs]
+    nothing = _Equation(np.zeros((2, 2)), np.zeros(2), 0.0, 0.0)
+    times = [leg.times[camera] + delay for leg in legs]
     if sum(len(t) for t in times) < FEWEST_FRAMES:
-        return 0.0, 0.0, 0.0, 0.0
+        return nothing
     joint = legs[0].trial
-    positions = np.concatenate([leg.positions_at(t + delay) for leg, t in zip(legs, times, strict=True)])
-    shown, aside = positions[:, joint], _others(np.delete(positions, joint, axis=1))
-    speed = np.concatenate([np.interp(t + delay, *_speeds(leg, joint)) for leg, t in zip(legs, times, strict=True)])
+    readings = [leg.positions_at(t) for leg, t in zip(legs, times, strict=True)]
+    begin = np.concatenate([np.full(len(t), leg.ends[0, joint]) for leg, t in zip(legs, times, strict=True)])
     ahead = np.concatenate(
-        [
-            np.full(len(t), np.sign(leg.positions[-1, joint] - leg.positions[0, joint]))
-            for leg, t in zip(legs, times, strict=True)
-        ]
+        [np.full(len(t), np.sign(np.diff(leg.ends[:, joint]))) for leg, t in zip(legs, times, strict=True)]
     )
-    pixels = np.concatenate([leg.pixels[camera] for leg in legs])
-    low, high = float(shown.min()), float(shown.max())
-    across, square, squares, freedom = 0.0, 0.0, 0.0, 0.0
-    seen = finite_rows(pixels)
+    speed = np.concatenate([np.interp(t, *_speeds(leg, joint)) for leg, t in zip(legs, times, strict=True)])
+    positions, pixels = np.concatenate(readings), np.concatenate([leg.pixels[camera] for leg in legs])
+    links, aside = positions[:, joint] - 0.5 * play * ahead, _others(np.delete(positions, joint, axis=1))
+    taken_up = np.abs(positions[:, joint] - begin) >= abs(play)
+    low, high = float(links.min()), float(links.max())
+    square, across, squares, freedom = nothing
+    seen = finite_rows(pixels) & taken_up[:, None]
     for mask in np.unique(seen, axis=1).T:
-        count = min(DELAY_TERMS, int(mask.sum()) // 3)
+        terms = min(DELAY_TERMS, int(mask.sum()) // 3)
         if mask.sum() < FEWEST_FRAMES:
             continue
         mine = (seen == mask[:, None]).all(axis=0)
-        displaced = ahead[mask, None] * _columns(shown[mask], low, high, PLAY_TERMS if play else 0)
-        columns = np.column_stack([_columns(shown[mask], low, high, count), aside[mask], displaced])
-        slopes = np.polynomial.chebyshev.chebder(np.eye(count)) if count > 1 else np.zeros((0, count))
+        columns = np.column_stack([_columns(links[mask], low, high, terms), aside[mask]])
         basis, _ = np.linalg.qr(columns)
         tracks = pixels[mask][:, mine].reshape(int(mask.sum()), -1)
         coefficients, *_ = np.linalg.lstsq(columns, tracks, rcond=None)
         left = tracks - basis @ (basis.T @ tracks)
-        rates = _columns(shown[mask], low, high, max(count - 1, 1)) @ (slopes @ coefficients[:count])
-        rates *= (2.0 / max(high - low, 1e-12)) * speed[mask, None]
-        rates -= basis @ (basis.T @ rates)
-        across += float((rates * left).sum())
-        square += float((rates * rates).sum())
+        slopes = np.polynomial.chebyshev.chebder(np.eye(terms)) @ coefficients[:terms]
+        slopes = _columns(links[mask], low, high, terms - 1) @ slopes * (2.0 / max(high - low, 1e-12))
+        effects = np.array([slopes * speed[mask, None], slopes * (-0.5 * ahead[mask, None])])
+        effects -= basis @ (basis.T @ effects)
+        square = square + np.einsum("ifk,jfk->ij", effects, effects)
+        across = across + np.einsum("ifk,fk->i", effects, left)
         squares += float((left * left).sum())
         freedom += float(left.size - columns.shape[1] * left.shape[1])
-    return across, square, squares, freedom
+    return _Equation(square, across, squares, freedom)
 
 
 def _others(positions: FloatArray) -> FloatArray:

@@ -116,7 +116,7 @@ class CalibrationJobs:
         except (CalibrationError, OSError) as error:
             self._failed(self._fit_id, str(error), getattr(error, "code", ""))
             return
-        message = f"{self._job.stops} stops"
+        message = f"{self._job.frames} frames of sweeps" if self._job.frames else f"{self._job.stops} stops"
         if self._job.standing:
             markers = ", ".join(str(marker) for marker in self._job.standing)
             message += f"; markers {markers} stood still: they are not of the body, and left out"

@@ -7,7 +7,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.calibration.static_points import static_markers, static_observations
-from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, stamp_delays
+from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, links_displaced, sweep_timing
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations, finite_rows
 from stereoservo.core.cycle import Event, PathFrame, PathRecord
 from stereoservo.core.settings import CameraSettings, CoreSettings
@@ -166,6 +166,7 @@ class TrialCollector:
         starts = {leg: 1e-9 * (_first_ns(records, leg) - start_ns) for leg in trial_of}
         order = sorted(starts)
         frames = sorted((frame for _, record in records for frame in record.frames), key=lambda frame: frame.t_ns)
+        resolution = np.array(self._settings.resolution or (0.0,) * positions.shape[1])
         legs = []
         for leg, following in zip(order, [*order[1:], None], strict=True):
             begin, end = starts[leg], float(times[-1]) if following is None else starts[following]
@@ -181,7 +182,10 @@ class TrialCollector:
                     end,
                     times[around],
                     positions[around],
-                    *(tuple(o[k] for o in observed) for k in range(3)),
+                    tuple(stamps for stamps, _, _ in observed),
+                    tuple(pixels for _, pixels, _ in observed),
+                    tuple(variances for _, _, variances in observed),
+                    resolution,
                 )
             )
         return legs
@@ -231,9 +235,13 @@ def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, L
     """The sweeps with their means, each of as many frames as are averaged at a stop, at the cameras' own delays."""
     if not legs or settings.trials is None:
         return []
-    delays, _ = stamp_delays(legs, len(settings.cameras))
-    found = [(leg, leg_means(leg, delays, settings.trials.frames)) for leg in legs]
-    return [(leg, means) for leg, means in found if means is not None]
+    timing = sweep_timing(legs, len(settings.cameras))
+    found = []
+    for leg, displaced in zip(legs, links_displaced(legs, timing.play), strict=True):
+        means = leg_means(leg, timing.delays, settings.trials.frames)
+        if means is not None:
+            found.append((leg, means._replace(positions=means.positions + displaced)))
+    return found
 
 
 def _first_ns(records: list[tuple[int, PathRecord]], leg: int) -> int:
