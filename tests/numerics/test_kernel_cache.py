@@ -55,6 +55,21 @@ enclosed = around(FACTOR)
 """
 
 
+LONG = (
+    """
+import math
+
+from stereoservo.numerics.compilation import kernel
+
+FACTOR = 10.0
+
+@kernel
+def twice(x):
+"""
+    + "    x += 0.0 * math.sin(x)\n" * 200
+    + "    return 2 * x\n"
+)
+
 TAKES_PAIR = """
 from acme.{home} import Pair
 from stereoservo.numerics.compilation import kernel
@@ -143,6 +158,21 @@ def test_a_kernel_of_before_an_upgrade_is_not_taken_for_one_of_after(acme: Path,
     upgrade = f"import pathlib, acme.caller; pathlib.Path({str(file)!r}).write_text({after!r})"
     assert run(acme, tmp_path / "cache", upgrade)[0] == 20.0
     assert run(acme, tmp_path / "cache")[0] == 30.0
+
+
+def test_a_long_kernel_is_called_by_symbol_and_its_caller_is_renewed_where_the_symbol_is_lost(
+    acme: Path, tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache"
+    (acme / "called.py").write_text(LONG)
+    assert run(acme, cache) == (20.0, {"caller", "twice"})
+    (caller,), (called,) = cache.rglob("caller.caller*.nbc"), cache.rglob("called.twice*.nbc")
+    assert caller.stat().st_size < called.stat().st_size
+    os.utime(acme / "called.py", (0, 0))  # installed again, with the same content
+    assert run(acme, cache) == (20.0, set())
+    called.unlink()
+    assert run(acme, cache) == (20.0, {"caller", "twice"})  # the new symbol has another number
+    assert run(acme, cache) == (20.0, set())
 
 
 @pytest.mark.parametrize("change", ["moved", "damaged"])

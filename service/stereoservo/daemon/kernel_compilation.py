@@ -42,7 +42,7 @@ from stereoservo.control.incidence import (
 from stereoservo.control.law import Options, Scene, Task
 from stereoservo.control.law_registry import LAWS
 from stereoservo.control.laws.cartesian3 import cartesian_step
-from stereoservo.control.marker_groups import FLAT_PX, find_groups
+from stereoservo.control.marker_groups import with_groups
 from stereoservo.control.mobility import mobility
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.core.cycle import ModelUpdate, StepInputs
@@ -79,8 +79,8 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import KERNELS, Overload, load, overloads, tell_compiled
-from stereoservo.numerics.kernel_cache import SHIPPED, file_hash, shipped_folder
+from stereoservo.numerics.compilation import load, overloads, tell_compiled
+from stereoservo.numerics.kernel_cache import KERNELS, SHIPPED, Overload, file_hash, shipped_folder
 from stereoservo.planning.plan import PlanLimits, PlanRequest
 from stereoservo.planning.planner import plan
 from stereoservo.planning.tracking import advance, sample_plan
@@ -137,8 +137,6 @@ def warm_up() -> None:
     for mount in ("eye_in_hand", "eye_to_hand"):
         _warm_up_following(mount)
     model = example_model()
-    matrices = np.array([camera.matrix for camera in model.cameras])
-    find_groups(model.marker_points, matrices, FLAT_PX, model.generators, exhaustive=0)
     _warm_up_fault_isolation(model, _example_pixels(model))
 
 
@@ -585,6 +583,7 @@ def main() -> int:
                 print(f"{SHIPPED}: {shipped.misfit()}; compiling instead", file=sys.stderr)
             collect_seldom()
             warm_up()
+            with_groups(example_model())  # in fits and the gateway: no servo process loads these
             os.execv(sys.executable, [sys.executable, "-m", MODULE, sys.argv[1], RECORD])
     return 0
 

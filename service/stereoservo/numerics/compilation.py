@@ -5,18 +5,19 @@ list and log of the kernels that this process has compiled.
 from __future__ import annotations
 
 import atexit
-import importlib
+import functools
 import os
 import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import event, types
+from numba.core.registry import cpu_target
 
-from stereoservo.numerics.kernel_cache import KernelCache
+from stereoservo.numerics.kernel_cache import KERNELS, KernelCache, Overload, call_by_symbol
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -29,17 +30,6 @@ plain tuple. The kernel unpacks the fields in order, or makes the record from th
 
 LOG_VARIABLE = "STEREOSERVO_COMPILE_LOG"
 """Environment variable: file to which every process appends one line of JSON for each signature that it compiles."""
-
-KERNELS: dict[tuple[str, str], Any] = {}
-"""The kernels that this process has imported, by module and name."""
-
-
-class Overload(NamedTuple):
-    """One compiled signature of a kernel; can be pickled."""
-
-    module: str
-    name: str
-    arguments: tuple[Any, ...]
 
 
 def kernel(function: _F) -> _F:
@@ -83,16 +73,12 @@ def overloads() -> Iterator[Overload]:
 def load(wanted: Iterable[Overload]) -> Iterator[None]:
     """Load kernels from the cache, one per step of the iterator; kernels that are not in the cache are compiled."""
     for overload in wanted:
-        key = (overload.module, overload.name)
-        if key not in KERNELS:
-            importlib.import_module(overload.module)
-        if key in KERNELS and overload.arguments not in KERNELS[key].overloads:
-            KERNELS[key].compile(overload.arguments)
+        if overload.load():
             yield
 
 
 def _compile(function: _F, **more: Any) -> _F:
-    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", **more}
+    options: dict[str, Any] = {"fastmath": False, "error_model": "numpy", "no_cfunc_wrapper": True, **more}
     compiled = numba.njit(**options)(function)
     if compiled is not function:  # equal with NUMBA_DISABLE_JIT
         try:
@@ -100,6 +86,8 @@ def _compile(function: _F, **more: Any) -> _F:
         except RuntimeError as error:  # numba: "cannot cache function ...: no locator available"
             warnings.warn(f"{error}; compiling at every start", RuntimeWarning, stacklevel=3)
         _forget_literals(compiled)
+        if function.__closure__ is None:  # else another one may have its name
+            _call_by_symbol(compiled)
         KERNELS[function.__module__, function.__qualname__] = compiled
     return cast(_F, compiled)
 
@@ -115,6 +103,17 @@ def _forget_literals(dispatcher: Any) -> None:
         )
 
     dispatcher.get_call_template = get_call_template
+
+
+def _call_by_symbol(dispatcher: Any) -> None:
+    """Apply `call_by_symbol` to each signature that is compiled."""
+    function, add = dispatcher.py_func, dispatcher.add_overload
+
+    def add_overload(compiled: Any) -> None:
+        call_by_symbol(Overload(function.__module__, function.__qualname__, compiled.signature.args), compiled)
+        add(compiled)
+
+    dispatcher.add_overload = add_overload
 
 
 def tell_compiled(tell: Callable[[int], None]) -> None:
@@ -135,6 +134,15 @@ class _Counting(event.Listener):  # type: ignore[misc]
         function = event.data["dispatcher"].py_func
         if (function.__module__, function.__qualname__) in KERNELS:
             self._tell(sum(len(dispatcher.overloads) for dispatcher in KERNELS.values()))
+
+
+def _make_passes_once() -> None:
+    """Use the same function passes for all functions: llvmlite does not free those of each, some 30 kB."""
+    codegen = cpu_target.target_context.codegen()
+    codegen._function_pass_manager = functools.cache(codegen._function_pass_manager)
+
+
+_make_passes_once()
 
 
 class _CompileLog(event.Listener):  # type: ignore[misc]

@@ -13,11 +13,11 @@ import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import llvmlite.binding
 import numpy as np
-from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 SHIPPED = "stereoservo_kernels"
 """The package of that distribution: a folder for each package that has kernels, with the files of numba's cache."""
@@ -25,19 +25,88 @@ LEVELS = {"haswell": ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe"), "
 """Processor levels for which its code is compiled, the best first, with the required processor features."""
 
 
+INLINED = 150
+"""Lines of LLVM code (optimised, without wrappers) up to which a kernel is linked into its callers and optimised again
+in each; a longer one is called by its symbol.
+"""
+
+KERNELS: dict[tuple[str, str], Any] = {}
+"""The kernels that this process has imported, by module and name."""
+
+
+class Overload(NamedTuple):
+    """One compiled signature of a kernel; can be pickled."""
+
+    module: str
+    name: str
+    arguments: tuple[Any, ...]
+
+    def load(self) -> bool:
+        """Load it from the cache, or compile it; whether that was necessary and its kernel still exists."""
+        key = (self.module, self.name)
+        if key not in KERNELS:
+            importlib.import_module(self.module)
+        if key not in KERNELS or self.arguments in KERNELS[key].overloads:
+            return False
+        KERNELS[key].compile(self.arguments)
+        return True
+
+
+_BY_SYMBOL: dict[str, Overload] = {}
+"""The kernels of this process that are called by symbol."""
+
+
+def call_by_symbol(overload: Overload, compiled: Any) -> None:
+    """Have kernels call this one, if it is long, by its symbol: its code is not linked into theirs."""
+    library, symbol = compiled.library, compiled.fndesc.llvm_func_name
+    wrappers = compiled.fndesc.llvm_cpython_wrapper_name, compiled.fndesc.llvm_cfunc_wrapper_name
+    functions = [f for f in library._final_module.functions if not f.is_declaration and f.name not in wrappers]
+    if sum(str(function).count("\n") for function in functions) > INLINED:
+        empty = library.codegen._create_empty_module(library.name)
+        library._shared_module = llvmlite.binding.parse_assembly(str(empty))
+        _BY_SYMBOL[symbol] = overload
+
+
+class _Linked(CompileResultCacheImpl):  # type: ignore[misc]
+    """A kernel in the cache with the kernels that it calls by symbol: they are loaded before it."""
+
+    def reduce(self, cres: Any) -> Any:
+        module, symbol = cres.library._final_module, cres.fndesc.llvm_func_name
+        declared = [function.name for function in module.functions if function.is_declaration]
+        called = {name: _BY_SYMBOL[name] for name in declared if name in _BY_SYMBOL}
+        return _BY_SYMBOL.get(symbol), called, super().reduce(cres)
+
+    def rebuild(self, target_context: Any, payload: Any) -> Any:
+        overload, called, compiled = payload
+        engine, fndesc = target_context.codegen()._engine, compiled[1]
+        for symbol, callee in called.items():
+            callee.load()
+            if not engine.is_symbol_defined(symbol):  # another process has compiled it since
+                return None
+        if overload is not None:
+            engine._defined_symbols |= {fndesc.llvm_func_name, fndesc.llvm_cpython_wrapper_name}
+            _BY_SYMBOL[fndesc.llvm_func_name] = overload
+        return super().rebuild(target_context, compiled)
+
+
 class KernelCache(FunctionCache):  # type: ignore[misc]
     """numba's cache of one kernel. Raises RuntimeError if no cache directory is writable.
 
     numba recompiles a kernel when its own file has changed. Here the key also contains the sources of the kernels that
-    it calls, and the constants that are compiled into them: after an upgrade or an edit, no outdated code is run.
+    it calls, and the constants that are compiled into them: after an upgrade or an edit, no outdated code is run. numba
+    also recompiles when only the date of the file has changed; here, files of the same content are the same file, so an
+    upgrade compiles only kernels that reach a changed file.
     """
+
+    _impl_class = _Linked
 
     def __init__(self, py_func: Any) -> None:
         super().__init__(py_func)
-        file_hash(inspect.getfile(py_func))  # as imported: an upgrade may change the file before compilation
+        self._stamp = file_hash(inspect.getfile(py_func))  # as imported: an upgrade may change the file later
+        self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, self._stamp)
 
     def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
-        return (*super()._index_key(sig, codegen), dependencies(self._py_func))
+        return (*super()._index_key(sig, codegen), dependencies(self._py_func), INLINED)
 
     def _load_overload(self, sig: Any, target_context: Any) -> Any:
         for load in (super()._load_overload, self._load_shipped):
@@ -70,9 +139,7 @@ class KernelCache(FunctionCache):  # type: ignore[misc]
         if folder is None:
             return None
         package = self._py_func.__module__.rpartition(".")[0]
-        file = IndexDataCacheFile(
-            str(folder / package), self._impl.filename_base, self._impl.locator.get_source_stamp()
-        )
+        file = IndexDataCacheFile(str(folder / package), self._impl.filename_base, self._stamp)
         codegen = target_context.codegen()
         signature, (triple, *_), *sources = self._index_key(sig, codegen)
         for processor in levels_here():

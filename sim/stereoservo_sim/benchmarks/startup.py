@@ -50,7 +50,7 @@ def wait_compiled(client: Client) -> StateMessage:
 
 def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str, Any]:
     """``first``, ``second``: start of the demo's cell with an empty and with the full cache. ``kernels``: compiled by
-    the first. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
+    the first, ``modules``: their sums. ``commands``: CPU seconds, beside those of an interpreter that does nothing.
 
     Raises ExperimentError if the daemon does not start.
     """
@@ -71,6 +71,7 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
         "second": starts[1] | {"signatures": sum(row["signatures"] for row in again)},
         "signatures": sum(row["signatures"] for row in kernels),
         "compile_cpu_s": sum(row["seconds"] for row in kernels),
+        "modules": modules_of(kernels),
         "repeated": [row["kernel"] for row in kernels if row["repeated"]],
         "commands": commands,
         "kernels": kernels,
@@ -149,6 +150,7 @@ def compiled_kernels(log: Path) -> list[dict[str, Any]]:
     rows = [
         {
             "kernel": name,
+            "module": those[0]["module"],
             "signatures": len(those),
             "repeated": name.startswith("stereoservo") and len(those) > 1,
             "seconds": sum(line["seconds"] for line in those),
@@ -157,6 +159,19 @@ def compiled_kernels(log: Path) -> list[dict[str, Any]]:
         for name, those in found.items()
     ]
     return sorted(rows, key=lambda row: -row["seconds"])
+
+
+def modules_of(kernels: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Signatures and CPU seconds of `compiled_kernels` by module, the longest first; numba's modules as one."""
+    found: dict[str, list[dict[str, Any]]] = defaultdict(list)
+    for row in kernels:
+        module = row["module"] if row["module"].startswith("stereoservo") else "numba"
+        found[module].append(row)
+    sums = [
+        {"module": name} | {key: sum(row[key] for row in rows) for key in ("signatures", "seconds")}
+        for name, rows in found.items()
+    ]
+    return sorted(sums, key=lambda row: -row["seconds"])
 
 
 def _lines(log: Path) -> list[dict[str, Any]]:
@@ -180,9 +195,13 @@ def _commands(repetitions: int, progress: ProgressCall) -> dict[str, Any]:
 
 
 def show_startup(figures: dict[str, Any], console: Console) -> dict[str, Any]:
-    """Print the table of compiled kernels; returns the rest of the figures."""
+    """Print the tables of compiled kernels and of their modules; returns the rest of the figures."""
     table = Table("kernel", "signatures", "seconds", "processes", box=None)
     for row in figures["kernels"]:
         table.add_row(row["kernel"], str(row["signatures"]), f"{row['seconds']:.2f}", " ".join(row["processes"]))
     console.print(table)
-    return {key: value for key, value in figures.items() if key != "kernels"}
+    sums = Table("module", "signatures", "seconds", box=None)
+    for row in figures["modules"]:
+        sums.add_row(row["module"], str(row["signatures"]), f"{row['seconds']:.2f}")
+    console.print(sums)
+    return {key: value for key, value in figures.items() if key not in ("kernels", "modules")}
