@@ -47,7 +47,7 @@ def fake_cell(**calibration: Any) -> CellFile:
         "calibration": {
             "base": dict(zip(NAMES, demo_cell().base.tolist(), strict=True)),
             "range": dict(zip(NAMES, (0.2, 0.2, 0.2, 0.5, 0.4, 0.6), strict=True)),
-            "stops": 5, "frames": 2, "settle_s": 0.05, "speed_scale": 1.0, **calibration,
+            "motion": "stops", "stops": 5, "frames": 2, "settle_s": 0.05, "speed_scale": 1.0, **calibration,
         },
     }  # fmt: skip
     return check_cell(tree)
@@ -68,7 +68,7 @@ def pictured_cell(path: Path, stops: int) -> Path:
     for old, new in (
         ('name = "demo"', 'name = "replayed"'),
         ('background = "pybullet"', 'background = "plain"'),
-        ("stops = 9", f"stops = {stops}"),
+        ("stops = 9", f'motion = "stops"\nstops = {stops}'),
         ("frames = 4", "frames = 2"),
         ("rate_hz = 250.0", "rate_hz = 100.0"),
         ('driver = "pybullet"            # rigid', 'driver = "fake"  # rigid'),

@@ -16,6 +16,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from stereoservo.calibration.single_joint_fit import MIN_STOPS
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.cli.output import CommandError, log
 from stereoservo.core.cycle import Event
@@ -340,6 +341,13 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
         gathered.add(_observations(camera, gathered, log, progress))
     job = TrialCollector(settings)
     events = gathered.events()
+    if len(events) < MIN_STOPS:
+        raise CalibrationError(
+            "too_few_stops",
+            f"the recording shows the arm at rest {len(events)} times with markers in view; at least {MIN_STOPS} "
+            'stops a joint are needed: record a calibration with [calibration] motion = "stops"',
+            stops=len(events),
+        )
     for event in events:
         job.add(event)
     trials = job.trials()
