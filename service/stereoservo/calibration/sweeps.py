@@ -125,6 +125,8 @@ def leg_means(leg: Leg, delays: FloatArray, frames_each: int) -> LegMeans | None
                 mine = track.used & (intervals[camera] == k)
                 if not mine.any() or 2 * int(mine.sum()) < int((intervals[camera] == k).sum()):
                     continue
+                if not track.low <= node <= track.high:
+                    continue  # polynomials do not extrapolate
                 weights = track.weights(along[camera], mine, node)
                 pixels[camera, row, marker] = weights @ leg.pixels[camera][track.used, marker]
                 single[camera, row, marker] = leg.variances[camera][mine, marker].mean()

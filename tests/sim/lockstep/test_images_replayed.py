@@ -68,7 +68,8 @@ def pictured_cell(path: Path, stops: int) -> Path:
     for old, new in (
         ('name = "demo"', 'name = "replayed"'),
         ('background = "pybullet"', 'background = "plain"'),
-        ("stops = 9", f'motion = "stops"\nstops = {stops}'),
+        ('motion = "sweeps"', 'motion = "stops"'),
+        ("stops = 9", f"stops = {stops}"),
         ("frames = 4", "frames = 2"),
         ("rate_hz = 250.0", "rate_hz = 100.0"),
         ('driver = "pybullet"            # rigid', 'driver = "fake"  # rigid'),
