@@ -48,10 +48,9 @@ FEWEST_FRAMES = 12
 class Leg(msgspec.Struct, frozen=True, eq=False):
     """Observations on one leg, from ``start_s`` to ``end_s``. ``trial``: the joint that moves alone, -1 if several do.
 
-    Joint samples, before and after the leg as well: ``joint_times`` (j,) [s], ``positions`` (j, n); the readings are
-    exact to ``resolution`` (n,). For each camera its
-    frames: ``times`` (f,) [s] as stamped, ``pixels`` (f, m, 2) raw, NaN where a marker is not seen, ``variances``
-    (f, m) [px²] of a coordinate, as stated.
+    Joint samples, before and after the leg as well: ``joint_times`` (j,) [s], ``positions`` (j, n), read in steps of
+    ``resolution`` (n,). Frames of each camera: ``times`` (f,) [s] as stamped, raw ``pixels`` (f, m, 2), NaN where a
+    marker is not seen, and ``variances`` (f, m) [px²] of a coordinate, as stated.
     """
 
     trial: int
