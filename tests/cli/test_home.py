@@ -84,7 +84,7 @@ def test_the_motion_that_is_named_tells_postures_apart(name: str) -> None:
         before = home._estimate_zeros(one.arm, observations)
         motion = home._informative_motion(one.arm, observations[0], before)
         assert motion is not None
-        assert motion.told >= 12  # of 28 pairs: half of the postures at least
+        assert motion.distinguished >= 12  # of 28 pairs: half of the postures at least
         one.readings[motion.joint] += motion.step
         after = home._estimate_zeros(one.arm, [*observations, one.look()])
         assert len(after.alternatives) <= len(before.alternatives) // 2, seed

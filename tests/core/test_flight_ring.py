@@ -223,4 +223,4 @@ def test_the_thread_writes_what_it_is_given_and_counts_what_it_cannot_take(
     (segment,) = kept.glob("*.mcap")
     result = replay(segment)
     assert (result.identical, result.gaps) == (True, 1)
-    assert [kind for kind, _ in thread.said] == ["ring_kept"]
+    assert [kind for kind, _ in thread.reports] == ["ring_kept"]
