@@ -13,6 +13,7 @@ import msgspec
 import pytest
 
 from stereoservo.cli import record
+from stereoservo.cli.output import CellOptions
 from stereoservo.client import Client, FailedError, client, events
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.goals import JointTarget
@@ -108,8 +109,8 @@ class ScriptedClient(Client):
 def run_record(made: ScriptedClient) -> object:
     printed: list[Any] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(record, "Client", lambda *args, **options: made)
-        patch.setattr(record, "emit", lambda result, text, json: printed.append(result))
+        patch.setattr(CellOptions, "client", lambda *arguments: made)
+        patch.setattr(CellOptions, "emit", lambda _, result, text: printed.append(result))
         record.record("demo", seconds=0.05, images=True)
     return printed[0]["images"]
 
