@@ -101,7 +101,7 @@ def test_limits_are_those_of_the_page() -> None:
 def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(bench: Bench) -> None:
     gateway = MagicMock(
         _announce_due_s=None, _state=MagicMock(newest=None), _observations=[],
-        _stop=MagicMock(enables=[]), _steps_taken=0.0, _heartbeat=bench.process,
+        _stop=MagicMock(enables=[]), _steps_recorded=0.0, _heartbeat=bench.process,
     )  # fmt: skip
     gateway._servo.events.return_value = ()
     queries = MagicMock()
