@@ -301,17 +301,7 @@ def _settings(
     n = len(cell.home)
     low, high = cell.home - limit, cell.home + limit
     trials = TrialSettings(
-        q.copy(),
-        np.where(cell.ranges > 0.0, cell.ranges, np.nan),
-        STOPS,
-        FRAMES,
-        0.2,
-        1.0,
-        4,
-        0.05,
-        1.0,
-        16,
-        sweeps=True,
+        q.copy(), np.where(cell.ranges > 0.0, cell.ranges, np.nan), STOPS, FRAMES, 0.2, 1.0, 4, 0.05, 1.0
     )
     return CoreSettings(
         cell="campaign",
