@@ -22,8 +22,11 @@ FEWEST_TERMS, MOST_TERMS, MORE_TERMS = 3, 24, 2
 """Range of the number of a track's polynomial terms that the data show, and how many more are used: what is left out
 would be an error that all markers share.
 """
-LEAST_FREEDOM, FEWEST_FRAMES_OF_LEG = 3, 12
-"""Least degrees of freedom that are left beside them, and least number of a camera's frames on a leg."""
+LEAST_FREEDOM = 3
+"""Least degrees of freedom that are left beside them."""
+FEWEST_FRAMES = 12
+"""Least number of a camera's frames on a leg that is reduced, and of those of a joint from which delays are estimated.
+"""
 FAR_SIGMAS = 6.0
 """Residual of an observation, in robust deviations of its track, above which it is a wrong detection."""
 LINE = 0.5, 0.95
@@ -41,8 +44,6 @@ STILL, MOST_OTHERS = 1e-6, 3
 """Motion of other joints [rad or m, rms] that is taken into account, and most directions of it."""
 DELAY_TERMS = 10
 """Most polynomial terms of a joint's tracks, there and back, beside the delay."""
-FEWEST_FRAMES = 12
-"""Least number of a camera's frames with a joint in motion from which its delay is estimated."""
 
 
 class Leg(msgspec.Struct, frozen=True, eq=False):
@@ -102,7 +103,7 @@ def leg_means(leg: Leg, delays: FloatArray, frames_each: int) -> LegMeans | None
     along = [(q - middle) @ line / (line @ line) for q in shown]
     straight = [_near_line(q - middle, a, line, leg.resolution) for q, a in zip(shown, along, strict=True)]
     most = max((a[near] for a, near in zip(along, straight, strict=True)), key=len)
-    if len(most) < max(frames_each, FEWEST_FRAMES_OF_LEG):
+    if len(most) < max(frames_each, FEWEST_FRAMES):
         return None
     edges = np.quantile(most, np.linspace(0.0, 1.0, len(most) // frames_each + 1))
     inner = edges[1:-1]

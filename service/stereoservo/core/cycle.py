@@ -115,14 +115,14 @@ class Sample(msgspec.Struct, frozen=True, eq=False):
 
 class PathFrame(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     """A frame taken in motion: number of its ``camera`` in the cell, stated shutter time, markers' ``ids`` (k,), raw
-    ``pixels`` (k, 2), and of a sweep their ``covariances`` (k, 2, 2).
+    ``pixels`` (k, 2), and of a sweep the stated ``variances`` (k,) of a coordinate [px²].
     """
 
     camera: int
     t_ns: int
     ids: IntArray
     pixels: FloatArray
-    covariances: FloatArray | None = None
+    variances: FloatArray | None = None
 
 
 class PathRecord(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):

@@ -270,7 +270,7 @@ class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):
     base; ``corner``: combinations of offsets tried; ``leg``: number of the sweep, of joint ``trial`` or of all, -1.
     ``base_pixels``, ``last`` (c, m, 2) [px]: markers at the base and in each camera's last frame, at ``last_ns`` (c,),
     with ``rates`` (c, m, 2) [px/s].
-    ``recorded``: marker observations not yet sent; ``frames``: of all cameras so far.
+    ``arrived_ns``: since when it rests at the base after the last sweep, 0: not yet.
     """
 
     joint: int
@@ -281,8 +281,6 @@ class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):
     trial: int
     last_ns: IntArray
     rates: FloatArray
-    frames: int
-    recorded: int = 0
     arrived_ns: int = 0
 
 

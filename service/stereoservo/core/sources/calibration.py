@@ -22,22 +22,25 @@ from stereoservo.core.cycle import PathFrame, PathRecord, Sample
 from stereoservo.core.monitors.collision import learnt_loads
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.measure_at_pose import (
+    abort,
     at_target,
     blocked,
     collect_samples,
     continue_move,
     enter,
     first_visit,
+    marker_rows,
     markers_lost,
     mean_joints,
+    rest,
     too_few_seen,
     too_slow,
     trial_settings,
     unseen_at_base,
 )
-from stereoservo.core.state import CalibrationMotion
+from stereoservo.core.state import CalibrationMotion, TrialMotion
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.ports.devices import JointKindName
 
 NO_STEP = 1e-9  # step of a side without planned stops
@@ -68,34 +71,35 @@ def trials_step(trials: CalibrationMotion, context: StepContext) -> SourceOutput
         return _move(trials, context, settings)
     samples = collect_samples(trials, context, settings)
     if samples is None:
-        return _rest(context)
+        return rest(context)
     return _stop_done(trials, context, settings, samples)
 
 
-def _rest(context: StepContext, *, finished: bool = False) -> SourceOutput:
-    return SourceOutput(np.zeros_like(context.q), finished=finished)
+def finish(trials: TrialMotion, context: StepContext) -> SourceOutput:
+    """The end of trial motions that are done."""
+    context.emit(
+        "calibration_finished",
+        id=trials.id,
+        message="trial motions done",
+        progress=1.0,
+        loads=learnt_loads(trials.id, context.state),
+    )
+    return rest(context, finished=True)
 
 
 def _move(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
     if at_target(trials, context):
         if trials.phase == "finish":
-            context.emit(
-                "calibration_finished",
-                id=trials.id,
-                message="trial motions done",
-                progress=1.0,
-                loads=learnt_loads(trials.id, context.state),
-            )
-            return _rest(context, finished=True)
+            return finish(trials, context)
         if trials.phase == "return":
             return _next(trials, context, settings)
         enter(trials, "settle", context)
-        return _rest(context)
+        return rest(context)
     reason = too_slow(trials, context, settings)
     if reason is not None and _combining(trials) and trials.phase == "move":
         return _left_out(trials, context, f"is not reached: {reason.hint}")
     if reason is not None:
-        return _abort(trials, context, reason)
+        return abort(trials, context, reason)
     if trials.phase == "move" and trials.joint >= 0 and markers_lost(trials, context, settings):
         return _turn_done(trials, context, settings, "in motion")
     return continue_move(trials, context, settings)
@@ -107,7 +111,7 @@ def _stop_done(
     poorest = too_few_seen(samples, settings, context.settings.scene_ids)
     if poorest is not None:
         if trials.joint < 0 and trials.turn < 0:
-            return _abort(trials, context, unseen_at_base(poorest, settings, context.settings.scene_ids))
+            return abort(trials, context, unseen_at_base(poorest, settings, context.settings.scene_ids))
         return _turn_done(trials, context, settings, "at the stop")
     mean = mean_joints(trials)
     # The base with the spread joint turned is a stop of that joint's own.
@@ -140,32 +144,40 @@ def _record_path(trials: CalibrationMotion, context: StepContext) -> None:
     """Record the observations on the path to a stop, until its markers are averaged; a path that is too long is not
     recorded.
     """
-    cameras = [camera.name for camera in context.settings.cameras]
-    for observation in context.observations:
+    for camera, observation in context.ingested.observations:
         if len(trials.path_frames) < PATH_FRAMES and observation.ids.size:
             chosen = slice(None, None, max(1, -(-observation.ids.size // PATH_MARKERS)))
             trials.path_frames.append(
                 PathFrame(
-                    cameras.index(observation.camera),
+                    camera,
                     observation.t_shutter_ns,
                     np.asarray(observation.ids[chosen], dtype=np.int64),
                     np.array(observation.pixels[chosen]),
                 )
             )
+    if len(trials.path_ns) < PATH_JOINTS:
+        record_joints(trials, context)
+
+
+def record_joints(trials: TrialMotion, context: StepContext) -> None:
+    """Record the joint sample, unless it is too near to the last one."""
     now_ns = context.state.block.numbers.last_joints_ns
-    due = not trials.path_ns or now_ns - trials.path_ns[-1] >= PATH_APART_NS
-    if due and len(trials.path_ns) < PATH_JOINTS:
+    if not trials.path_ns or now_ns - trials.path_ns[-1] >= PATH_APART_NS:
         trials.path_ns.append(now_ns)
         trials.path_joints.append(context.q.copy())
 
 
-def _path_record(trials: CalibrationMotion) -> PathRecord | None:
-    """The record of the path that ends here; recording restarts for the next one."""
+def taken_path(trials: TrialMotion, leg: int = 0) -> PathRecord:
+    """The record of the path so far; recording restarts."""
     frames, times, joints = trials.path_frames, trials.path_ns, trials.path_joints
     trials.path_frames, trials.path_ns, trials.path_joints = [], [], []
-    if len(times) == PATH_JOINTS or len(frames) < 2:
-        return None
-    return PathRecord(tuple(frames), np.array(times, dtype=np.int64), np.array(joints))
+    return PathRecord(tuple(frames), np.array(times, dtype=np.int64), np.array(joints), leg)
+
+
+def _path_record(trials: CalibrationMotion) -> PathRecord | None:
+    """The record of the path that ends here, if it is whole and shows motion."""
+    record = taken_path(trials)
+    return None if len(record.joints_ns) == PATH_JOINTS or len(record.frames) < 2 else record
 
 
 def _remember(
@@ -258,7 +270,7 @@ def _turn_done(
     if trials.turn + 1 < turns:
         _turn_to(trials, context, settings, trials.turn + 1)
         enter(trials, "move", context)
-        return _rest(context)
+        return rest(context)
     if trials.joint < 0 or (_combining(trials) and not lost):
         return _next(trials, context, settings)
     if _combining(trials):
@@ -284,22 +296,22 @@ def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
             if not _aim_all(trials, context, settings):
                 trials.target = settings.base.copy()
                 enter(trials, "finish", context)
-            return _rest(context)
+            return rest(context)
         if trials.joint >= 0:
             if trials.step == 0.0:  # its range is not known yet
                 size = probe_size(context.settings.joint_kinds[trials.joint])
                 if _aim(trials, context, settings, trials.side * size):
-                    return _rest(context)
+                    return rest(context)
                 _probe_failed(trials)
                 continue
             if _further(trials, context, settings):
-                return _rest(context)
+                return rest(context)
             if trials.side > 0:
                 _other_side(trials, settings)
                 continue
             poor = _poor(trials, context, settings)
             if poor is not None:
-                return _abort(trials, context, poor)
+                return abort(trials, context, poor)
         trials.joint += 1
         if _combining(trials):
             trials.k = 0
@@ -443,7 +455,7 @@ def _left_out(trials: CalibrationMotion, context: StepContext, why: str) -> Sour
     context.emit("warning", id=trials.id, message=f"calibration: stop {trials.k} of all joints {why}; left out")
     trials.target = trial_settings(context.settings).base.copy()
     enter(trials, "return", context)
-    return _rest(context)
+    return rest(context)
 
 
 def _back_off(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, where: str) -> SourceOutput:
@@ -467,7 +479,7 @@ def _back_off(trials: CalibrationMotion, context: StepContext, settings: TrialSe
         else:
             trials.count = 0
     enter(trials, "return", context)
-    return _rest(context)
+    return rest(context)
 
 
 def _poor(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> Reason | None:
@@ -482,11 +494,6 @@ def _poor(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
         context.settings,
         settings,
     )
-
-
-def _abort(trials: CalibrationMotion, context: StepContext, reason: Reason) -> SourceOutput:
-    context.emit("calibration_aborted", id=trials.id, message=reason.hint, reasons=(reason,))
-    return _rest(context, finished=True)
 
 
 # -- where the stops are ------------------------------------------------------------------------------------------
@@ -570,12 +577,10 @@ def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
 def marker_pixels(samples: tuple[Sample, ...], core: CoreSettings) -> tuple[FloatArray, FloatArray]:
     """Pixels (c, m, 2) and sigmas (c, m) [px] of a stop in the cell's order, NaN where a marker was not seen."""
     row = {camera.name: c for c, camera in enumerate(core.cameras)}
-    column = {marker: i for i, marker in enumerate(core.marker_ids)}
-    pixels = np.full((len(row), len(column), 2), np.nan)
-    sigmas = np.full((len(row), len(column)), np.nan)
+    pixels = np.full((len(row), len(core.marker_ids), 2), np.nan)
+    sigmas = np.full(pixels.shape[:2], np.nan)
     for sample in samples:
-        c = row[sample.camera]
-        seen = [column[marker] for marker in sample.ids.tolist()]
+        c, seen = row[sample.camera], marker_rows(core, sample.ids)
         pixels[c, seen] = sample.pixels
         sigmas[c, seen] = np.sqrt(0.5 * (sample.covariances[:, 0, 0] + sample.covariances[:, 1, 1]))
     return pixels, sigmas
@@ -595,8 +600,8 @@ def image_motion(base: FloatArray, pixels: FloatArray, sigmas: FloatArray) -> fl
     return best
 
 
-def _needed(seen: int, settings: TrialSettings) -> int:
-    return max(settings.min_markers, int(np.ceil(KEPT * seen)))
+def _needed(seen: IntArray | int, settings: TrialSettings) -> IntArray:
+    return np.maximum(settings.min_markers, np.ceil(KEPT * np.asarray(seen))).astype(np.int64)
 
 
 def enough_inside(pixels: FloatArray, core: CoreSettings, settings: TrialSettings) -> bool:
@@ -611,8 +616,7 @@ def inside_by_margin(pixels: FloatArray, core: CoreSettings, settings: TrialSett
         known = np.isfinite(pixels[:, c]).all(axis=-1)
         kept = (_inside(pixels[:, c], camera.width, camera.height) & known).sum(axis=-1)
         seen = known.sum(axis=-1)
-        needed = np.maximum(settings.min_markers, np.ceil(KEPT * seen))
-        enough &= (seen == 0) | (kept >= needed)
+        enough &= (seen == 0) | (kept >= _needed(seen, settings))
     return enough
 
 
@@ -678,14 +682,20 @@ def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, setting
     if not ways:
         return 0.0
     ways.sort(reverse=True)
-    return float(ways[min(_needed(len(ways), settings), len(ways)) - 1])
+    return float(ways[min(int(_needed(len(ways), settings)), len(ways)) - 1])
 
 
 def too_little(
-    joint: int, stops: int, visited: float, motion: float, sigma_px: float, core: CoreSettings, settings: TrialSettings
+    joint: int,
+    stops: int | None,
+    visited: float,
+    motion: float,
+    sigma_px: float,
+    core: CoreSettings,
+    settings: TrialSettings,
 ) -> Reason | None:
     """Why a joint's trial cannot identify it, and the remedy: too few stops, too small a range, or too little motion in
-    the images (``motion`` in sigmas of ``sigma_px``); None if it can.
+    the images (``motion`` in sigmas of ``sigma_px``); None if it can. ``stops``: None for a sweep.
     """
     name = core.joint_names[joint]
     stated = np.isfinite(settings.range[joint])
@@ -694,7 +704,8 @@ def too_little(
         if stated
         else "put the base where this joint has more room before the border of a view or its limit"
     )
-    if stops < MIN_STOPS or visited < settings.min_range:
+    at_stops, least_stops = ("", "") if stops is None else (f"at {stops} stops ", f"{MIN_STOPS} stops over ")
+    if (stops is not None and stops < MIN_STOPS) or visited < settings.min_range:
         return Reason(
             "TRIAL_TOO_SMALL",
             "hold",
@@ -702,8 +713,8 @@ def too_little(
             visited,
             settings.min_range,
             "rad or m",
-            f"joint {name} was seen at {stops} stops over {visited:.3f}; at least {MIN_STOPS} stops over "
-            f"{settings.min_range} are needed: change calibration.base so that the markers stay in view, or {wider}",
+            f"joint {name} was seen {at_stops}over {visited:.3f}; at least {least_stops}{settings.min_range} are "
+            f"needed: change calibration.base so that the markers stay in view, or {wider}",
         )
     if motion < MIN_MOTION_SIGMAS:
         more = MIN_MOTION_SIGMAS / max(motion, 0.1)

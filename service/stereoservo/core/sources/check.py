@@ -12,6 +12,7 @@ import numpy as np
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.measure_at_pose import (
+    abort,
     at_target,
     blocked,
     collect_samples,
@@ -20,6 +21,7 @@ from stereoservo.core.sources.measure_at_pose import (
     first_visit,
     markers_lost,
     mean_joints,
+    rest,
     too_few_seen,
     too_slow,
     trial_settings,
@@ -27,7 +29,6 @@ from stereoservo.core.sources.measure_at_pose import (
 )
 from stereoservo.core.state import CheckMotion
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray
 
 SHARE = 0.5
@@ -78,15 +79,14 @@ def start_check(goal_id: str, context: StepContext, model: CellModel, reset_zero
 def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
     """One step of the check motion."""
     trial = trial_settings(context.settings)
-    rest = SourceOutput(np.zeros_like(context.q))
     last = len(checking.targets) - 1
     if checking.phase in ("settle", "collect"):
         samples = collect_samples(checking, context, trial)
         if samples is None:
-            return rest
+            return rest(context)
         poorest = too_few_seen(samples, trial, context.settings.scene_ids)
         if poorest is not None and checking.index == 0:
-            return _abort(checking, context, unseen_at_base(poorest, trial, context.settings.scene_ids))
+            return abort(checking, context, unseen_at_base(poorest, trial, context.settings.scene_ids))
         if poorest is None:
             checking.seen += 1
         context.emit(
@@ -106,12 +106,12 @@ def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
                 progress=1.0,
                 name=RESET_ZEROS if checking.reset_zeros else "",
             )
-            return SourceOutput(rest.velocity, finished=True)
+            return rest(context, finished=True)
         enter(checking, "settle", context)
-        return rest
+        return rest(context)
     reason = too_slow(checking, context, trial)
     if reason is not None:
-        return _abort(checking, context, reason)
+        return abort(checking, context, reason)
     if checking.index > 0 and markers_lost(checking, context, trial) and checking.index < last:
         context.emit("warning", id=checking.id, message=f"check: stop {checking.index} loses the markers; left out")
         return _next(checking, context)
@@ -126,9 +126,4 @@ def _next(checking: CheckMotion, context: StepContext) -> SourceOutput:
         checking.index += 1
     checking.target = checking.targets[checking.index].copy()
     enter(checking, "move", context)
-    return SourceOutput(np.zeros_like(context.q))
-
-
-def _abort(checking: CheckMotion, context: StepContext, reason: Reason) -> SourceOutput:
-    context.emit("calibration_aborted", id=checking.id, message=reason.hint, reasons=(reason,))
-    return SourceOutput(np.zeros_like(context.q), finished=True)
+    return rest(context)

@@ -44,6 +44,12 @@ def _sorted_ids(cameras: tuple[CameraSettings, ...]) -> IntArray:
     return ids
 
 
+def marker_rows(settings: CoreSettings, ids: IntArray) -> IntArray:
+    """Index (k,) of each marker in `CoreSettings.marker_ids`; -1 for others."""
+    known = _sorted_ids(settings.cameras)
+    return rows_of(ids.astype(np.int64), known, np.arange(known.size))
+
+
 def add_observation(
     sums: ObservationStatistics,
     settings: CoreSettings,
@@ -58,8 +64,7 @@ def add_observation(
     if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
         return False
     sums.frames[camera] += 1
-    ids = _sorted_ids(settings.cameras)
-    found = rows_of(observation.ids.astype(np.int64), ids, np.arange(ids.size))
+    found = marker_rows(settings, observation.ids)
     rows = np.flatnonzero(found >= 0)
     if not rows.size:
         return True
@@ -146,6 +151,17 @@ def enter(visit: PoseMeasurement, phase: Phase, context: StepContext) -> None:
         visit.sums = ObservationStatistics(**measurement_buffers(context.settings))
         visit.joint_sum = np.zeros_like(context.q)
         visit.joint_frames = 0
+
+
+def rest(context: StepContext, *, finished: bool = False) -> SourceOutput:
+    """No motion."""
+    return SourceOutput(np.zeros_like(context.q), finished=finished)
+
+
+def abort(visit: PoseMeasurement, context: StepContext, reason: Reason) -> SourceOutput:
+    """The end of the programme for a reason."""
+    context.emit("calibration_aborted", id=visit.id, message=reason.hint, reasons=(reason,))
+    return rest(context, finished=True)
 
 
 def at_target(visit: PoseMeasurement, context: StepContext) -> bool:

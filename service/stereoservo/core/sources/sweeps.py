@@ -11,28 +11,33 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
-from stereoservo.core.cycle import PathFrame, PathRecord
-from stereoservo.core.monitors.collision import learnt_loads
+from stereoservo.core.cycle import PathFrame
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.calibration import (
     BRAKING,
     enough_inside,
+    finish,
     image_motion,
     inside_by_margin,
     marker_pixels,
+    record_joints,
     room,
+    taken_path,
     too_little,
 )
 from stereoservo.core.sources.joint_move import approach_velocity, arrived, joints_ahead
 from stereoservo.core.sources.measure_at_pose import (
     AT_REST,
+    abort,
     at_target,
     blocked,
     collect_samples,
     enter,
     first_visit,
+    marker_rows,
     markers_lost,
     mean_joints,
+    rest,
     too_few_seen,
     too_slow,
     trial_settings,
@@ -52,14 +57,14 @@ NEW = 3.0
 """Weight of the range that a joint has not visited yet, against the length of its sweep, in that choice."""
 FRAMES_OF_SWEEP = 16
 """Least number of frames of the slowest camera on one sweep; shorter sweeps are slower."""
+SLOWEST = 0.05
+"""Least speed of a sweep, as a fraction of that of trial motions."""
 PASSED = 0.05
 """Fraction of a sweep's length from its end at which the next one begins."""
 LATE_S = 0.3
 """How long frames are awaited at the end of the last sweep."""
 CHUNK = 2000
 """Number of marker observations from which an event is sent before its sweep ends."""
-APART_NS = 2_000_000
-"""Least time between joint samples that are kept [ns]."""
 
 
 def start_sweeps(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSettings) -> SweepMotion:
@@ -72,7 +77,7 @@ def start_sweeps(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
         base_pixels=unseen, last=unseen.copy(), last_ns=np.zeros(len(settings.cameras), np.int64),
         rates=np.zeros_like(unseen), lowest=trials.base.copy(), highest=trials.base.copy(),
         motion_sigmas=np.zeros(n), sigma_px=0.0, slope_sums=np.zeros((n, *unseen.shape)),
-        slope_weights=np.zeros((n, *unseen.shape[:2])), frames=0,
+        slope_weights=np.zeros((n, *unseen.shape[:2])),
         **first_visit(trials.base, q, now_ns, settings),  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -83,51 +88,42 @@ def sweeps_step(sweeps: SweepMotion, context: StepContext) -> SourceOutput:
     if sweeps.phase in ("settle", "collect"):
         samples = collect_samples(sweeps, context, settings)
         if samples is None:
-            return _rest(context)
+            return rest(context)
         poorest = too_few_seen(samples, settings, context.settings.scene_ids)
         if poorest is not None:
-            return _abort(sweeps, context, unseen_at_base(poorest, settings, context.settings.scene_ids))
+            return abort(sweeps, context, unseen_at_base(poorest, settings, context.settings.scene_ids))
         context.emit("calibration_sample", id=sweeps.id, joints=mean_joints(sweeps), samples=samples, progress=0.0)
         sweeps.base_pixels, sigmas = marker_pixels(samples, context.settings)
         sweeps.sigma_px = float(np.median(sigmas[np.isfinite(sigmas)]))
         return _next(sweeps, context, settings)
     if sweeps.leg >= 0:
         _record(sweeps, context)
-    if sweeps.phase == "finish":
-        return _finish(sweeps, context, settings)
+    if sweeps.phase == "finish" and at_target(sweeps, context):
+        return _end(sweeps, context)
     reason = too_slow(sweeps, context, settings)
     if reason is not None:
-        return _abort(sweeps, context, reason)
-    if sweeps.phase == "move":
-        if at_target(sweeps, context):
-            enter(sweeps, "settle", context)
-            return _rest(context)
-        return _approach(sweeps, context, settings)
-    if sweeps.outward and (lost := _leaving(sweeps, context, settings)):
-        return _turn_back(sweeps, context, settings, lost)
-    if _passed(sweeps, context) or (sweeps.outward and _enough(sweeps, context, settings)):
-        return _next(sweeps, context, settings)
+        return abort(sweeps, context, reason)
+    if sweeps.phase == "move" and at_target(sweeps, context):
+        enter(sweeps, "settle", context)
+        return rest(context)
+    if sweeps.phase == "sweep":
+        lost = sweeps.outward and markers_lost(sweeps, context, settings)
+        if lost or (sweeps.outward and _leaving(sweeps, context, settings)):
+            _warn_of_end(sweeps, context, lost)
+            return _next(sweeps, context, settings)
+        if _passed(sweeps, context) or (sweeps.outward and _enough(sweeps, context, settings)):
+            return _next(sweeps, context, settings)
     return _approach(sweeps, context, settings)
-
-
-def _rest(context: StepContext, *, finished: bool = False) -> SourceOutput:
-    return SourceOutput(np.zeros_like(context.q), finished=finished)
-
-
-def _abort(sweeps: SweepMotion, context: StepContext, reason: Reason) -> SourceOutput:
-    context.emit("calibration_aborted", id=sweeps.id, message=reason.hint, reasons=(reason,))
-    return _rest(context, finished=True)
 
 
 def _approach(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
     """The velocity towards the target, so slow that the slowest camera takes `FRAMES_OF_SWEEP` frames."""
-    limits = context.settings.limits
-    speed = limits.velocity_max * limits.speed_scale
-    shortest_s = float((np.abs(sweeps.target - sweeps.start) / speed).max())
-    slowest_hz = min(camera.rate_hz for camera in context.settings.cameras)
-    shortest_s *= ALONE if sweeps.trial >= 0 and sweeps.outward else 1.0
-    scale = min(settings.speed_scale, shortest_s * slowest_hz / FRAMES_OF_SWEEP)
-    scale = settings.speed_scale if sweeps.phase != "sweep" else max(scale, 0.05 * settings.speed_scale)
+    limits, scale = context.settings.limits, settings.speed_scale
+    if sweeps.phase == "sweep":
+        full_s = float((np.abs(sweeps.target - sweeps.start) / (limits.velocity_max * limits.speed_scale)).max())
+        full_s *= ALONE if sweeps.trial >= 0 and sweeps.outward else 1.0
+        slowest_hz = min(camera.rate_hz for camera in context.settings.cameras)
+        scale = min(scale, max(full_s * slowest_hz / FRAMES_OF_SWEEP, SLOWEST * scale))
     velocity = approach_velocity(joints_ahead(context), sweeps.target, context.settings, scale)
     return SourceOutput(velocity, speed_scale=scale)
 
@@ -149,24 +145,14 @@ def _enough(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) 
     return offset >= max(ALONE * _range(joint, context, settings), 1.5 * settings.min_range)
 
 
-def _finish(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
-    """Arrive at the base, wait for frames that are under way, and end."""
-    if not at_target(sweeps, context):
-        reason = too_slow(sweeps, context, settings)
-        return _abort(sweeps, context, reason) if reason is not None else _approach(sweeps, context, settings)
+def _end(sweeps: SweepMotion, context: StepContext) -> SourceOutput:
+    """Wait at the base for frames that are under way, and end."""
     if not sweeps.arrived_ns:
         sweeps.arrived_ns = context.now_ns
     if (context.now_ns - sweeps.arrived_ns) * 1e-9 < LATE_S:
-        return _rest(context)
+        return rest(context)
     _send(sweeps, context)
-    context.emit(
-        "calibration_finished",
-        id=sweeps.id,
-        message="trial motions done",
-        progress=1.0,
-        loads=learnt_loads(sweeps.id, context.state),
-    )
-    return _rest(context, finished=True)
+    return finish(sweeps, context)
 
 
 # -- what is recorded -----------------------------------------------------------------------------------------
@@ -174,35 +160,26 @@ def _finish(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) 
 
 def _record(sweeps: SweepMotion, context: StepContext) -> None:
     """Record the frames and joint samples of this step, and how the markers move."""
-    names = [camera.name for camera in context.settings.cameras]
-    for observation in context.observations:
-        camera = names.index(observation.camera)
-        sweeps.path_frames.append(
-            PathFrame(
-                camera,
-                observation.t_shutter_ns,
-                np.array(observation.ids, dtype=np.int64),
-                np.array(observation.pixels),
-                np.array(observation.covariances),
-            )
+    for camera, observation in context.ingested.observations:
+        frame = PathFrame(
+            camera,
+            observation.t_shutter_ns,
+            np.array(observation.ids, dtype=np.int64),
+            np.array(observation.pixels),
+            0.5 * np.trace(observation.covariances, axis1=1, axis2=2),
         )
-        sweeps.recorded += observation.ids.size
-        sweeps.frames += 1
-        _track(sweeps, context, camera, sweeps.path_frames[-1])
-    now_ns = context.state.block.numbers.last_joints_ns
-    if not sweeps.path_ns or now_ns - sweeps.path_ns[-1] >= APART_NS:
-        sweeps.path_ns.append(now_ns)
-        sweeps.path_joints.append(context.q.copy())
-    if sweeps.recorded >= CHUNK:
+        sweeps.path_frames.append(frame)
+        _track(sweeps, context, frame)
+    record_joints(sweeps, context)
+    if context.ingested.observations and sum(frame.ids.size for frame in sweeps.path_frames) >= CHUNK:
         _send(sweeps, context)
 
 
-def _track(sweeps: SweepMotion, context: StepContext, camera: int, frame: PathFrame) -> None:
+def _track(sweeps: SweepMotion, context: StepContext, frame: PathFrame) -> None:
     """Update the rates of a camera's markers, and, while a joint moves alone, its effect on them."""
-    column = {marker: i for i, marker in enumerate(context.settings.marker_ids)}
-    seen = np.array([i for i in frame.ids.tolist() if i in column], dtype=np.int64)
+    camera, rows = frame.camera, marker_rows(context.settings, frame.ids)
     pixels = np.full(sweeps.last[camera].shape, np.nan)
-    pixels[[column[i] for i in seen.tolist()]] = frame.pixels[np.isin(frame.ids, seen)]
+    pixels[rows[rows >= 0]] = frame.pixels[rows >= 0]
     elapsed_s = (frame.t_ns - int(sweeps.last_ns[camera])) * 1e-9
     if 0.0 < elapsed_s < 1.0:
         sweeps.rates[camera] = (pixels - sweeps.last[camera]) / elapsed_s
@@ -232,48 +209,40 @@ def _send(sweeps: SweepMotion, context: StepContext) -> None:
             id=sweeps.id,
             trial=sweeps.trial,
             progress=min(1.0, done),
-            path=PathRecord(
-                tuple(sweeps.path_frames),
-                np.array(sweeps.path_ns, dtype=np.int64),
-                np.array(sweeps.path_joints),
-                sweeps.leg,
-            ),
+            path=taken_path(sweeps, sweeps.leg),
         )
-    sweeps.path_frames, sweeps.path_ns, sweeps.path_joints, sweeps.recorded = [], [], [], 0
 
 
 # -- where the joints sweep -----------------------------------------------------------------------------------
 
 
-def _leaving(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> str:
-    """Where the markers are lost, or will be before the joints have braked; empty if they remain in view."""
-    if markers_lost(sweeps, context, settings):
-        return "in motion"
+def _leaving(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> bool:
+    """Whether the markers will leave a view before the joints have braked."""
     if not context.observations:
-        return ""
+        return False
     limits = context.settings.limits
     turn_s = float((limits.velocity_max * limits.speed_scale / (BRAKING * limits.acceleration_max)).max())
     speed = np.abs(context.state.block.command)
     fastest = int(speed.argmax())
     if speed[fastest] < AT_REST or (sweeps.last_ns - sweeps.phase_ns).min() * 1e-9 < settings.speed_scale * turn_s:
-        return ""  # at rest, or the images are still of the sweep before
+        return False  # at rest, or the images are still of the sweep before
     to_go_s = float(np.abs(sweeps.target - context.q)[fastest] / speed[fastest])
     brake_s = float((speed / (BRAKING * limits.acceleration_max)).max())
     ages_s = np.minimum((context.now_ns - sweeps.last_ns) * 1e-9 + 0.5 * brake_s, to_go_s)
     ahead = sweeps.last + sweeps.rates * ages_s[:, None, None]
-    return "" if enough_inside(ahead[None], context.settings, settings) else "soon"
+    return not enough_inside(ahead[None], context.settings, settings)
 
 
-def _turn_back(sweeps: SweepMotion, context: StepContext, settings: TrialSettings, lost: str) -> SourceOutput:
-    """End an outward sweep before its target."""
-    if lost == "in motion" and sweeps.joint < sweeps.lowest.size:
-        name, at = context.settings.joint_names[sweeps.joint], context.q[sweeps.joint]
-        message = f"calibration: joint {name} loses the markers in motion at {at:+.3f}; backing off"
-        context.emit("warning", id=sweeps.id, message=message)
+def _warn_of_end(sweeps: SweepMotion, context: StepContext, lost: bool) -> None:
+    """Warn that a sweep ends before its target: of all joints, or because the markers are ``lost``."""
+    message = ""
     if sweeps.joint == sweeps.lowest.size:
         message = f"calibration: sweep {sweeps.corner} of all joints would lose the markers; ended there"
+    elif lost:
+        name, at = context.settings.joint_names[sweeps.joint], context.q[sweeps.joint]
+        message = f"calibration: joint {name} loses the markers in motion at {at:+.3f}; backing off"
+    if message:
         context.emit("warning", id=sweeps.id, message=message)
-    return _next(sweeps, context, settings)
 
 
 def _begin(sweeps: SweepMotion, context: StepContext, target: FloatArray, *, outward: bool) -> SourceOutput:
@@ -307,7 +276,7 @@ def _next(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) ->
                     return _begin(sweeps, context, target, outward=True)
             poor = _poor(sweeps, context, settings)
             if poor is not None:
-                return _abort(sweeps, context, poor)
+                return abort(sweeps, context, poor)
         sweeps.joint += 1
         sweeps.side = 1
         if sweeps.joint < n:
@@ -386,4 +355,4 @@ def _poor(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) ->
     joint = sweeps.joint
     visited = float(sweeps.highest[joint] - sweeps.lowest[joint])
     motion = float(sweeps.motion_sigmas[joint])
-    return too_little(joint, sweeps.frames, visited, motion, sweeps.sigma_px, context.settings, settings)
+    return too_little(joint, None, visited, motion, sweeps.sigma_px, context.settings, settings)

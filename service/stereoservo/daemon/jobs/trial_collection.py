@@ -9,8 +9,9 @@ import numpy as np
 from stereoservo.calibration.static_points import static_markers, static_observations
 from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, links_displaced, sweep_timing
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations, finite_rows
-from stereoservo.core.cycle import Event, PathFrame, PathRecord
+from stereoservo.core.cycle import Event, PathFrame
 from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.sources.measure_at_pose import marker_rows
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.numerics.arrays import FloatArray
 
@@ -73,18 +74,16 @@ class TrialCollector:
         legs = self._legs()
         means = _means_of_legs(legs, settings)
         cameras = settings.cameras
-        column = {marker: k for k, marker in enumerate(settings.marker_ids)}
         row = {camera.name: c for c, camera in enumerate(cameras)}
         factors = [self._factor_at_stops(camera) for camera in cameras]
         in_motion = np.array([_factor_in_motion(means, c) for c in range(len(cameras))])[:, None, None]
-        shape = (len(cameras), len(self._stops), len(column))
+        shape = (len(cameras), len(self._stops), len(settings.marker_ids))
         pixels, sigmas = np.full((*shape, 2), np.nan), np.full(shape, np.nan)
         images = sum(int(of_leg.frames.sum()) for _, of_leg in means)
         for s, event in enumerate(self._stops):
             for sample in event.samples:
                 images += sample.frames
-                c = row[sample.camera]
-                at = [column[i] for i in sample.ids.tolist()]
+                c, at = row[sample.camera], marker_rows(settings, sample.ids)
                 noise = 0.5 * np.trace(sample.covariances, axis1=1, axis2=2) - cameras[c].systematic_px ** 2
                 pixels[c, s, at] = sample.pixels
                 sigmas[c, s, at] = np.sqrt(factors[c] * noise + cameras[c].systematic_px ** 2)
@@ -163,7 +162,8 @@ class TrialCollector:
         times = np.concatenate([1e-9 * (record.joints_ns - start_ns) for _, record in records])
         positions = np.concatenate([record.positions for _, record in records])
         trial_of = {record.leg: trial for trial, record in records}
-        starts = {leg: 1e-9 * (_first_ns(records, leg) - start_ns) for leg in trial_of}
+        # Of the records of a leg the first one counts.
+        starts = {record.leg: 1e-9 * (int(record.joints_ns[0]) - start_ns) for _, record in reversed(records)}
         order = sorted(starts)
         frames = sorted((frame for _, record in records for frame in record.frames), key=lambda frame: frame.t_ns)
         resolution = np.array(self._settings.resolution or (0.0,) * positions.shape[1])
@@ -244,24 +244,18 @@ def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, L
     return found
 
 
-def _first_ns(records: list[tuple[int, PathRecord]], leg: int) -> int:
-    return min(int(record.joints_ns[0]) for _, record in records if record.leg == leg)
-
-
 def _observations(
     frames: list[PathFrame], camera: int, start_ns: int, settings: CoreSettings
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Stamps (f,) [s] of a camera's frames, pixels (f, m, 2) and variances (f, m) of the cell's markers in them."""
     mine = [frame for frame in frames if frame.camera == camera]
-    column = {marker: i for i, marker in enumerate(settings.marker_ids)}
-    pixels = np.full((len(mine), len(column), 2), np.nan)
-    variances = np.full((len(mine), len(column)), np.nan)
+    pixels = np.full((len(mine), len(settings.marker_ids), 2), np.nan)
+    variances = np.full(pixels.shape[:2], np.nan)
     for f, frame in enumerate(mine):
-        known = [k for k, marker in enumerate(frame.ids.tolist()) if marker in column]
-        at = [column[int(frame.ids[k])] for k in known]
-        pixels[f, at] = frame.pixels[known]
-        if frame.covariances is not None:
-            variances[f, at] = 0.5 * np.trace(frame.covariances[known], axis1=1, axis2=2)
+        rows = marker_rows(settings, frame.ids)
+        pixels[f, rows[rows >= 0]] = frame.pixels[rows >= 0]
+        if frame.variances is not None:
+            variances[f, rows[rows >= 0]] = frame.variances[rows >= 0]
     return np.array([1e-9 * (frame.t_ns - start_ns) for frame in mine]), pixels, variances
 
 
