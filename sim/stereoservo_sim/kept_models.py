@@ -30,8 +30,8 @@ from stereoservo.messages.files import write_atomically
 from stereoservo.numerics.kernel_cache import file_hash
 
 CACHE_VARIABLE = "STEREOSERVO_CACHE_DIR"
-ANEW_VARIABLE = "STEREOSERVO_LEARN_ANEW"
-"""Environment variable by which `learning_anew` reaches the processes of an experiment."""
+RELEARN_VARIABLE = "STEREOSERVO_RELEARN"
+"""Environment variable by which `relearning` reaches the processes of an experiment."""
 LIMIT_BYTES = 64_000_000
 """Of all kept models; those that were not used for the longest time are removed."""
 FIT = tuple(f"stereoservo.{package}" for package in ("numerics", "geometry", "kinematics", "calibration"))
@@ -71,14 +71,14 @@ def models_folder() -> Path:
 
 
 @contextmanager
-def learning_anew(anew: bool = True) -> Iterator[None]:
-    """With ``anew``, nothing is read from the store in the meantime, by this process and those that it starts."""
-    before = os.environ.get(ANEW_VARIABLE, "")
-    os.environ[ANEW_VARIABLE] = "1" if anew else before
+def relearning(relearn: bool = True) -> Iterator[None]:
+    """With ``relearn``, nothing is read from the store in the meantime, by this process and those that it starts."""
+    before = os.environ.get(RELEARN_VARIABLE, "")
+    os.environ[RELEARN_VARIABLE] = "1" if relearn else before
     try:
         yield
     finally:
-        os.environ[ANEW_VARIABLE] = before
+        os.environ[RELEARN_VARIABLE] = before
 
 
 def model_of_trials(trials: TrialData) -> KeptModel:
@@ -98,11 +98,11 @@ def kept_model(given: object, learn: Callable[[], CellModel], packages: tuple[st
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         lock = (path.parent / "lock").open("ab")
     except OSError as error:
-        _tell_once(f"learnt models are not kept: {path.parent}: {error.strerror}; {CACHE_VARIABLE} sets a directory")
+        _warn_once(f"learnt models are not kept: {path.parent}: {error.strerror}; {CACHE_VARIABLE} sets a directory")
         return KeptModel(_as_stored(learn())[0], False, None)
     with lock:
         fcntl.lockf(lock, fcntl.LOCK_EX, 1, int(key[:8], 16))  # a byte for each key
-        found = None if os.environ.get(ANEW_VARIABLE) else _read(path)
+        found = None if os.environ.get(RELEARN_VARIABLE) else _read(path)
         if found is not None:
             return KeptModel(found, True, path)
         model, data = _as_stored(learn())
@@ -132,7 +132,7 @@ def _write(path: Path, data: bytes) -> bool:
         write_atomically(path, data)
         sizes = {file: file.stat() for file in path.parent.glob("*.json")}
     except OSError as error:
-        _tell_once(f"learnt models are not kept: {path.parent}: {error.strerror}; {CACHE_VARIABLE} sets a directory")
+        _warn_once(f"learnt models are not kept: {path.parent}: {error.strerror}; {CACHE_VARIABLE} sets a directory")
         return False
     total = 0
     for file, status in sorted(sizes.items(), key=lambda item: item[1].st_mtime_ns, reverse=True):
@@ -143,7 +143,7 @@ def _write(path: Path, data: bytes) -> bool:
 
 
 @functools.cache
-def _tell_once(text: str) -> None:
+def _warn_once(text: str) -> None:
     print(text, file=sys.stderr)
 
 

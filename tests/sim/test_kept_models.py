@@ -15,7 +15,7 @@ from stereoservo.cli.main import invoke
 from stereoservo.kinematics.model import CellModel, encode_model
 from stereoservo.numerics.kernel_cache import file_hash
 from stereoservo_sim import kept_models
-from stereoservo_sim.kept_models import code_hash, kept_model, learning_anew, model_of_trials
+from stereoservo_sim.kept_models import code_hash, kept_model, model_of_trials, relearning
 from stereoservo_sim.world.exact_model import exact_model
 from stereoservo_sim.world.synthetic import rx90
 
@@ -48,9 +48,9 @@ def test_the_same_trials_are_fitted_once_and_give_the_same_model_to_the_bit(fold
     assert again.facts["learnt"] == first.facts["learnt"] == again.model.created != ""
     assert model_of_trials(others).found is False
     assert len(list(folder.glob("*.json"))) == 2
-    with learning_anew():
+    with relearning():
         assert model_of_trials(trials).found is False
-    with learning_anew(False):
+    with relearning(False):
         assert model_of_trials(trials).found is True
 
 

@@ -26,7 +26,7 @@ COMMON = {
     ),
     "learn": (
         False,
-        Annotated[bool, typer.Option("--learn", help="Learn anew what is kept of earlier runs; docs/simulation.md.")],
+        Annotated[bool, typer.Option("--learn", help="Learn again what is kept of earlier runs; docs/simulation.md.")],
     ),
     "as_json": (False, Annotated[bool, typer.Option("--json", help="One JSON object on stdout.")]),
 }
@@ -39,9 +39,9 @@ def reproduce(
     """Run an experiment again and print our figures beside those to compare with."""
     # Before numpy is loaded: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.kept_models import learning_anew
+    from stereoservo_sim.kept_models import relearning
 
-    with learning_anew(learn):
+    with relearning(learn):
         _reproduce(experiment, seed, plot, html, as_json, given)
 
 

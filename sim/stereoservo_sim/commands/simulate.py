@@ -122,7 +122,7 @@ class SimulateOptions:
         typer.Option(help="The law alone, without goal, monitors and safety stage; the arm free has no others."),
     ] = False
     learn: Annotated[
-        bool, typer.Option("--learn", help="self: learn anew, although a model of the same trial motions is kept.")
+        bool, typer.Option("--learn", help="self: learn again, although a model of the same trial motions is kept.")
     ] = False
     draw: Draw = None
     limit: Annotated[int | None, typer.Option(min=1, help="Only the first so many tasks.")] = None
@@ -140,7 +140,7 @@ def simulate(given: SimulateOptions = SIMULATE_OPTIONS) -> None:
     """
     # Before numpy is loaded by the workers: threads of OpenBLAS only wait for each other on such small matrices.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from stereoservo_sim.kept_models import learning_anew
+    from stereoservo_sim.kept_models import relearning
     from stereoservo_sim.tasks.closed_loop import LoopSettings
 
     settings = LoopSettings(
@@ -158,7 +158,7 @@ def simulate(given: SimulateOptions = SIMULATE_OPTIONS) -> None:
         mechanics=_mechanics(given.mechanics, given.arm),
         core=_by_core(given.arm, given.law_only, given.calibration, given.centre),
     )
-    with learning_anew(given.learn):
+    with relearning(given.learn):
         answer = _answer(_given(given.tasks, given.draw, given.seed), given.limit, given.ids, settings, given.jobs)
     answer = {"file": None if given.tasks is None else str(given.tasks), "draw": given.draw, **answer}
     if given.as_json:
@@ -285,7 +285,7 @@ def _show(answer: dict[str, Any], console: Console) -> None:
         if answer[key] is not None:
             console.print(f"{name}: median {answer[key]['median']:.3g}{unit}, max {answer[key]['max']:.3g}{unit}")
     if model := answer["calibration"].get("model"):
-        source = f"kept in {model['file']}; --learn learns anew" if model["kept"] else "by this command"
+        source = f"kept in {model['file']}; --learn learns again" if model["kept"] else "by this command"
         console.print(f"model learnt {model['learnt']}, {source}", soft_wrap=True)
     console.print(f"{answer['seconds']:.1f} s")
 
