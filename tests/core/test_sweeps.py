@@ -110,3 +110,35 @@ def test_the_state_of_sweeps_survives_encoding(bench: Any) -> None:
     copy = decode_state(encode_state(state))
     assert type(copy.source) is type(state.source)
     assert encode_state(copy) == encode_state(state)
+
+
+def jitter_stamps(bench: Any, rng: np.random.Generator) -> None:
+    """Let the stamps of the frames deviate by a millisecond."""
+    shutter = bench._shutter
+
+    def jittered() -> None:
+        before = len(bench.pending)
+        shutter()
+        for k in range(before, len(bench.pending)):
+            stamped = bench.pending[k].t_shutter_ns + round(rng.normal(0.0, 1e6))
+            bench.pending[k] = msgspec.structs.replace(bench.pending[k], t_shutter_ns=stamped)
+
+    bench._shutter = jittered
+
+
+@pytest.mark.parametrize("jitters", [False, True])
+def test_the_arm_stops_where_stamps_are_not_exact(benches: Any, jitters: bool) -> None:
+    bench = sweeping(benches(2, noise_px=0.05), range=np.full(6, 0.3))
+    if jitters:
+        jitter_stamps(bench, np.random.default_rng(2))
+    end, chunks = calibrated(bench, 300.0)
+    assert end.kind == "calibration_finished", end
+    said = [e.message for e in bench.events if e.kind == "warning" and "stamps of camera" in e.message]
+    assert len(said) == (1 if jitters else 0), said
+    collector = TrialCollector(bench.settings)
+    for event in bench.events:
+        collector.add(event)
+    assert chunks
+    assert (collector.stops > 10) == jitters
+    assert (collector.frames == 0) == jitters
+    assert fit_model(collector.trials(), epoch=1).model.stratum == "metric"

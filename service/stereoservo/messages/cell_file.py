@@ -168,7 +168,7 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     base: dict[str, float] = {}
     range: dict[str, Positive] = {}
-    motion: Literal["sweeps", "stops"] = "stops"
+    motion: Literal["sweeps", "stops"] = "sweeps"
     """Joints stop for each measurement, or sweep while cameras with exact stamps run. With ``spread``, or an encoder
     coarser than 0.2 mrad (0.2 mm), they stop.
     """

@@ -58,7 +58,11 @@ class TrialCollector:
             self._stops.clear()
             self._sweeps.clear()
             self._loads = None
-        (self._stops if event.kind == "calibration_sample" else self._sweeps).append(event)
+        if event.kind == "calibration_frames":
+            self._sweeps.append(event)
+            return
+        self._sweeps.clear()  # stops after sweeps: their stamps are not exact enough
+        self._stops.append(event)
 
     def trials(self) -> TrialData:
         """All stops as trial data, without markers that no camera ever saw or that are static (``standing``).
@@ -186,6 +190,7 @@ class TrialCollector:
                     tuple(pixels for _, pixels, _ in observed),
                     tuple(variances for _, _, variances in observed),
                     resolution,
+                    tuple(camera.height for camera in self._settings.cameras),
                 )
             )
         return legs
@@ -238,7 +243,7 @@ def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, L
     timing = sweep_timing(legs, len(settings.cameras))
     found = []
     for leg, displaced in zip(legs, links_displaced(legs, timing.play), strict=True):
-        means = leg_means(leg, timing.delays, settings.trials.frames)
+        means = leg_means(leg, timing, settings.trials.frames)
         if means is not None:
             found.append((leg, means._replace(positions=means.positions + displaced)))
     return found
