@@ -37,6 +37,7 @@ LEAST_MOTION = 2e-3
 """Motion of a joint [rad or m] on a leg from which its play is taken up."""
 STRAIGHT = 1e-3
 """Largest deviation of a joint from a leg's line, as a fraction of half the leg, in a frame that is used."""
+SMOOTHED_S = 0.1
 ROUNDS = 12
 LONGEST_DELAY_S = 0.3
 CONVERGED = 1e-6
@@ -139,9 +140,11 @@ def leg_means(leg: Leg, timing: SweepTiming, frames_each: int) -> LegMeans | Non
     for camera in range(c):
         seen = finite_rows(tracks[camera]) & straight[camera][:, None]
         terms = MORE_TERMS + _terms(along[camera], tracks[camera], seen)
+        left, slopes = np.full(tracks[camera].shape, np.nan), np.zeros(tracks[camera].shape)
         for marker in np.flatnonzero(seen.sum(axis=0) >= frames_each):
             track = _track(along[camera], tracks[camera][:, marker], seen[:, marker], terms)
-            scatter[camera, marker], freedom[camera, marker] = track.scatter, track.freedom
+            left[track.used, marker], slopes[track.used, marker] = track.left, track.slopes
+            freedom[camera, marker] = track.freedom
             for row, (k, node) in enumerate(zip(used.tolist(), nodes.tolist(), strict=True)):
                 mine = track.used & (intervals[camera] == k)
                 if not mine.any() or 2 * int(mine.sum()) < int((intervals[camera] == k).sum()):
@@ -152,8 +155,23 @@ def leg_means(leg: Leg, timing: SweepTiming, frames_each: int) -> LegMeans | Non
                 pixels[camera, row, marker] = weights @ tracks[camera][track.used, marker]
                 single[camera, row, marker] = leg.variances[camera][mine, marker].mean()
                 counts[camera, row, marker] = 1.0 / float(weights @ weights)
+        scatter[camera], freedom[camera] = _own_scatter(left, slopes, freedom[camera])
     frames = np.array([int(near.sum()) for near in straight], dtype=np.int64)
     return LegMeans(positions, pixels, counts, single, frames, scatter, freedom)
+
+
+def _own_scatter(left: FloatArray, slopes: FloatArray, freedom: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Variance (m,) of a marker's coordinate from its residuals ``left`` (f, m, 2), NaN where there are none, with
+    ``freedom`` (m,), and what remains of that, without what moves all markers of a frame along their ``slopes``
+    (f, m, 2): errors of its joint positions or of its stamp.
+    """
+    sizes = (np.where(np.isfinite(left), slopes, 0.0) ** 2).sum(axis=-1)
+    whole = np.maximum(sizes.sum(axis=1), 1e-300)
+    several = np.isfinite(left[..., 0]).sum(axis=1) > 1
+    common = np.where(several, np.nansum(slopes * left, axis=(1, 2)) / whole, 0.0)
+    own = np.nansum((left - slopes * common[:, None, None]) ** 2, axis=(0, 2))
+    remaining = np.maximum(freedom - 0.5 * (sizes / whole[:, None])[several].sum(axis=0), 0.0)
+    return own / np.maximum(2.0 * remaining, 1e-300), remaining
 
 
 def links_displaced(legs: list[Leg], play: FloatArray) -> list[FloatArray]:
@@ -168,6 +186,24 @@ def links_displaced(legs: list[Leg], play: FloatArray) -> list[FloatArray]:
     return found
 
 
+def smoothed_readings(
+    times: FloatArray, positions: FloatArray, resolution: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Joint samples at even times, of joints read in steps of ``resolution`` (n,) by a quadratic over `SMOOTHED_S`: one
+    that passes many steps in that time is known far better than to one of them.
+    """
+    half = int(0.5 * SMOOTHED_S / max(float(np.median(np.diff(times))), 1e-4))
+    if not resolution.any() or half < 2:
+        return times, positions
+    even = np.linspace(times[0], times[-1], len(times))
+    weights = np.linalg.pinv(np.vander(np.linspace(-1.0, 1.0, 2 * half + 1), 3, increasing=True))[0]
+    found = np.array([np.interp(even, times, q) for q in positions.T]).T
+    for joint in np.flatnonzero(resolution):
+        around = np.pad(found[:, joint], half, mode="edge")
+        found[:, joint] = np.convolve(around, weights, mode="valid")
+    return even, found
+
+
 def _near_line(offsets: FloatArray, along: FloatArray, line: FloatArray, resolution: FloatArray) -> BoolArray:
     """Mask (f,) of joint positions near a leg's line."""
     aside = np.abs(offsets - along[:, None] * line)
@@ -176,8 +212,8 @@ def _near_line(offsets: FloatArray, along: FloatArray, line: FloatArray, resolut
 
 class _Track(NamedTuple):
     """Polynomial of a marker's track, in ``terms`` over [low, high]: its ``used`` observations (f,), the
-    ``inverse`` (terms, k) of their columns, their ``scatter`` about it [px²] and its degrees of ``freedom``, of one
-    coordinate.
+    ``inverse`` (terms, k) of their columns, what is ``left`` (k, 2) of them and their ``slopes`` (k, 2) along it, and
+    its degrees of ``freedom``, of one coordinate.
     """
 
     terms: int
@@ -185,7 +221,8 @@ class _Track(NamedTuple):
     high: float
     used: BoolArray
     inverse: FloatArray
-    scatter: float
+    left: FloatArray
+    slopes: FloatArray
     freedom: float
 
     def weights(self, along: FloatArray, mine: BoolArray, node: float) -> FloatArray:
@@ -237,13 +274,14 @@ def _track(along: FloatArray, pixels: FloatArray, seen: BoolArray, terms: int) -
         count = max(1, min(terms, int(used.sum()) - LEAST_FREEDOM))
         columns = _columns(along[used], low, high, count)
         inverse = np.asarray(np.linalg.pinv(columns), dtype=np.float64)
-        squares = ((pixels[used] - columns @ (inverse @ pixels[used])) ** 2).sum(axis=1)
+        left = pixels[used] - columns @ (inverse @ pixels[used])
+        squares = (left**2).sum(axis=1)
         freedom = float(len(columns) - count)
         limit = FAR_SIGMAS**2 * max(float(np.median(squares)) / np.log(2.0), 1e-12)  # chi² of two coordinates
         wrong = squares > limit
         if not wrong.any() or freedom <= LEAST_FREEDOM:
-            scatter = float(squares.sum()) / (2.0 * freedom) if freedom else 0.0
-            return _Track(count, low, high, used, inverse, scatter, freedom)
+            slopes = _slopes(columns, pixels[used], count, along[used], low, high)
+            return _Track(count, low, high, used, inverse, left, slopes, freedom)
         used[np.flatnonzero(used)[wrong]] = False
 
 
@@ -422,10 +460,12 @@ def _rates(leg: Leg, times: FloatArray) -> FloatArray:
 
 
 def stamp_scatter(
-    times: FloatArray, pixels: FloatArray, joint_times: FloatArray, positions: FloatArray
+    times: FloatArray, pixels: FloatArray, joint_times: FloatArray, positions: FloatArray, resolution: float = 0.0
 ) -> tuple[float, int]:
     """Mean square of the displacement that errors of a camera's stamps give to all markers of a frame, along their
     velocities, as a fraction of the variance of a coordinate; and the number of frames that showed it, 0 if too few.
+
+    What a joint read in steps of ``resolution`` errs at a stop is no fault of stamps, and left out.
 
     One joint moves: its ``positions`` (j,) at ``joint_times`` (j,) [s]; ``times`` (f,) [s] as stamped, increasing,
     ``pixels`` (f, m, 2), NaN where not seen. A frame is compared with the cubic through its four neighbours, less what
@@ -459,5 +499,6 @@ def stamp_scatter(
     common = float(np.median((along - speed[used] * late) ** 2 / variance[used], axis=1).min())
     beside = ((left**2).sum(axis=(1, 2))[used] - along**2) / variance[used] / (2.0 * counts[used] - 1.0)
     noise = float(np.median(beside))
-    excess = common / MEDIAN / noise - 1.0 if noise > 0.0 else 0.0
+    by_readings = float(np.median(speed[used] / np.abs(moves[:, used]).max(axis=0))) ** 2 * resolution**2 / 12.0
+    excess = (common / MEDIAN - by_readings) / noise - 1.0 if noise > 0.0 else 0.0
     return max(excess, 0.0) / float(counts[used].mean()), int(used.sum())

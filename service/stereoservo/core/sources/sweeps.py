@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.calibration.sweeps import stamp_scatter
+from stereoservo.calibration.sweeps import smoothed_readings, stamp_scatter
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import PathFrame
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
@@ -232,19 +232,18 @@ def _send(sweeps: SweepMotion, context: StepContext) -> None:
 
 def _judge_stamps(sweeps: SweepMotion, context: StepContext) -> None:
     """Add the scatter of the cameras' stamps on this sweep to its sums."""
+    start_ns, joint = sweeps.path_ns[0], sweeps.joint
+    times, readings = 1e-9 * (np.array(sweeps.path_ns) - start_ns), np.array(sweeps.path_joints)[:, [joint]]
+    resolution = np.array([context.settings.resolution[joint] if context.settings.resolution else 0.0])
+    times, readings = smoothed_readings(times, readings, resolution)
     for camera in range(len(sweeps.stamp_sums)):
         frames = sorted((f for f in sweeps.path_frames if f.camera == camera), key=lambda frame: frame.t_ns)
         pixels = np.full((len(frames), *sweeps.last.shape[1:]), np.nan)
         for k, frame in enumerate(frames):
             rows = marker_rows(context.settings, frame.ids)
             pixels[k, rows[rows >= 0]] = frame.pixels[rows >= 0]
-        start_ns = sweeps.path_ns[0]
-        scatter, count = stamp_scatter(
-            np.array([1e-9 * (frame.t_ns - start_ns) for frame in frames]),
-            pixels,
-            1e-9 * (np.array(sweeps.path_ns) - start_ns),
-            np.array(sweeps.path_joints)[:, sweeps.joint],
-        )
+        stamps = np.array([1e-9 * (frame.t_ns - start_ns) for frame in frames])
+        scatter, count = stamp_scatter(stamps, pixels, times, readings[:, 0], float(resolution[0]))
         sweeps.stamp_sums[camera] += count * scatter, count
 
 

@@ -7,7 +7,15 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.calibration.static_points import static_markers, static_observations
-from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, links_displaced, sweep_timing
+from stereoservo.calibration.sweeps import (
+    LONGEST_DELAY_S,
+    Leg,
+    LegMeans,
+    leg_means,
+    links_displaced,
+    smoothed_readings,
+    sweep_timing,
+)
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations, finite_rows
 from stereoservo.core.cycle import Event, PathFrame
 from stereoservo.core.settings import CameraSettings, CoreSettings
@@ -171,6 +179,7 @@ class TrialCollector:
         order = sorted(starts)
         frames = sorted((frame for _, record in records for frame in record.frames), key=lambda frame: frame.t_ns)
         resolution = np.array(self._settings.resolution or (0.0,) * positions.shape[1])
+        times, positions = smoothed_readings(times, positions, resolution)
         legs = []
         for leg, following in zip(order, [*order[1:], None], strict=True):
             begin, end = starts[leg], float(times[-1]) if following is None else starts[following]
