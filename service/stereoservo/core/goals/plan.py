@@ -364,9 +364,9 @@ def prepare(
         return joint_goal(goal, target, context)
     if isinstance(target, TaughtTarget):
         raise RefusalError("TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name)
-    epoch = trusted_model(context)
     if context.state.reanchoring is not None:
         refuse_while_moved(context.state)
+    epoch = trusted_model(context)
     if isinstance(target, IncidenceTarget):
         return start_incidence(goal, target, context, place_now(context) if place is None else place)
     _, law = law_of(goal, context)
@@ -439,5 +439,10 @@ def trusted_model(context: StepContext) -> int:
         raise RefusalError(
             "MODEL_SUSPECT",
             "the model no longer explains the images: check the cameras and the markers, then calibrate",
+        )
+    if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
+        why = state.comparison.reason
+        raise RefusalError(
+            why.code, why.hint, subject=why.subject, value=why.value, threshold=why.threshold, unit=why.unit
         )
     return state.model.epoch
