@@ -17,7 +17,7 @@ from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, ModelUpdate, encode
 from stereoservo.core.goals.accept import CONFIRMATION_S
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import COMPARED_ROUNDS, FEWEST_COMPARED, SILENT_S
+from stereoservo.core.monitor import COMPARED_ROUNDS, FEWEST_COMPARED, NOT_AT_REST, SILENT_S
 from stereoservo.core.monitors.fault_isolation import LinearisedProblem
 from stereoservo.core.prediction import MODEL_SIGMA_PX
 from stereoservo.core.servo_core import ServoCore
@@ -140,6 +140,19 @@ def test_a_camera_without_frames_is_waited_for_and_then_left_out() -> None:
     assert status.model == "unconfirmed"
     assert any(r.code == "MODEL_UNCONFIRMED" and "camera right delivers no frames" in r.hint for r in status.reasons)
     bench.run(1.0)
+    assert compared(bench) == [True]
+
+
+def test_it_is_compared_at_rest_only() -> None:
+    bench = kept()
+    bench.run(0.02)
+    assert bench.reply(bench.goal(JointTarget({"j1": float(BASE[0]) + 0.5}))).accepted
+    status = bench.run(0.5).status
+    assert status.command.any()
+    assert [r.hint for r in status.reasons if r.code == "MODEL_UNCONFIRMED"] == [NOT_AT_REST.hint]
+    assert bench.ended().kind == "goal_reached"
+    assert compared(bench) == []
+    bench.run(0.5)
     assert compared(bench) == [True]
 
 

@@ -661,6 +661,9 @@ SILENT_S = 3.0
 """Time [s] after which a camera that delivers no frames is left out of the comparison."""
 
 
+NOT_AT_REST = Reason("MODEL_UNCONFIRMED", "hold", hint="the kept model is compared while the arm rests without a goal")
+
+
 def _compare_kept_model(context: StepContext) -> Findings:
     """Compare a kept model with the images at rest, by the test of the model monitor; the model is used once
     `COMPARED_ROUNDS` rounds in succession agree.
@@ -670,7 +673,7 @@ def _compare_kept_model(context: StepContext) -> Findings:
     if comparison is None or state.readiness is not ModelReadiness.UNCONFIRMED or not looked_at or arrays is None:
         return ()
     if state.reanchoring is not None or not isinstance(state.source, Holding) or bool(state.block.command.any()):
-        comparison.rounds = 0
+        comparison.rounds, comparison.reason = 0, NOT_AT_REST
         return ()
     problem = present_problem(state, _cameras(looked_at), arrays, context.settings)
     lacking = _lacking(problem, comparison.since_ns, context)
@@ -709,10 +712,7 @@ def _lacking(problem: LinearisedProblem, since_ns: int, context: StepContext) ->
             continue
         shows = "delivers no frames: is it connected? See the daemon's log"
         if c in seen:
-            shows = (
-                f"shows {count} markers of it, {least} are needed. Bring the arm into the view of every camera (jog, "
-            )
-            shows += "home), or run calibrate --check"
+            shows = f"shows {count} of its markers, {least} are needed: jog the arm into view, or run calibrate --check"
         hint = f"the kept model is not confirmed: camera {camera.name} {shows}"
         return Reason("MODEL_UNCONFIRMED", "hold", camera.name, float(count), float(least), "markers", hint)
     return None

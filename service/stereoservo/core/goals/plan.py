@@ -441,8 +441,6 @@ def trusted_model(context: StepContext) -> int:
             "the model no longer explains the images: check the cameras and the markers, then calibrate",
         )
     if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
-        why = state.comparison.reason
-        raise RefusalError(
-            why.code, why.hint, subject=why.subject, value=why.value, threshold=why.threshold, unit=why.unit
-        )
+        r = state.comparison.reason
+        raise RefusalError(r.code, r.hint, subject=r.subject, value=r.value, threshold=r.threshold, unit=r.unit)
     return state.model.epoch
