@@ -96,13 +96,14 @@ class ServoConnection:
             return None
         return number
 
-    def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
+    def send_model(self, model: CellModel, reanchored: tuple[str, ...] = (), *, kept: bool = False) -> bool:
         """Send a model to the core, with the coplanar groups of its markers, which the loop has no time to compute.
+        ``reanchored``, ``kept``: see `cycle.ModelUpdate`.
 
         The covariance, which the loop does not use, is omitted: messages have a maximum size.
         """
         bare = with_groups(msgspec.structs.replace(model, covariance=None))
-        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
+        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored, kept)))
 
     def events(self) -> list[Event]:
         """Core events since the last call, in order."""
