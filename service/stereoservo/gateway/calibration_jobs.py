@@ -13,6 +13,7 @@ from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.check import RESET_ZEROS
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import CheckJob, FitFailedError, FitJob, calibration_result
+from stereoservo.gateway.learning import LearningProgress
 from stereoservo.gateway.persistence import ModelStore
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servo_connection import ServoConnection
@@ -35,6 +36,7 @@ class CalibrationJobs:
         log: EventLog,
         history: Path,
         known_length: str = "",
+        runtime: Path | None = None,
     ) -> None:
         self._settings = settings
         self._models = models
@@ -43,6 +45,7 @@ class CalibrationJobs:
         self._history = history
         self._known_length = known_length
         self._job = TrialCollector(settings)
+        self.learning = LearningProgress(settings, runtime)
         self._fit: FitJob | None = None
         self._fit_id = ""
         self._reported = False
@@ -74,6 +77,7 @@ class CalibrationJobs:
     def on_core_event(self, event: Event, *, fresh: bool) -> None:
         """Handle an event of the core; ``fresh``: it was not handled before a restart of the gateway."""
         self._job.add(event)
+        self.learning.on_event(event)
         if event.kind == "calibration_finished" and fresh:
             self._start_fit()
         elif event.kind == "check_finished" and fresh:
@@ -96,6 +100,7 @@ class CalibrationJobs:
 
     def _report_applied(self, goal_id: str, what: CalibrationResult | ZeroReset) -> None:
         """Report that the core has applied the model that was sent."""
+        self.learning.end()
         if isinstance(what, ZeroReset):
             self._log.add("zeros_reset", message=what.message, id=goal_id, reset=what, origin="gateway")
             return
@@ -238,6 +243,7 @@ class CalibrationJobs:
             self._send_to_core(model, self._check_id, reset, path)
 
     def _failed(self, goal_id: str, message: str, code: str = "") -> None:
+        self.learning.end()
         self._log.add("calibration_failed", message=message, id=goal_id, name=code, origin="gateway")
 
     def cancel(self) -> None:
@@ -246,3 +252,8 @@ class CalibrationJobs:
             if job is not None:
                 job.close()
         self._fit = self._check = None
+
+    def close(self) -> None:
+        """Cancel all jobs. Idempotent."""
+        self.cancel()
+        self.learning.end()

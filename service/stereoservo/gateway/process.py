@@ -150,6 +150,7 @@ class Gateway:
             self.log,
             directories.checks,
             "" if plan.cell.calibration is None else plan.cell.calibration.known_length,
+            directories.runtime,
         )
         self._relocalization = RelocalizationJobs(
             self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
@@ -438,6 +439,7 @@ class Gateway:
             notes=(*self._calibration.notes, *self._notes.texts),
             refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
             refinement=self._refinement.state(),
+            learning=self._calibration.learning.state(),
         )
 
     def _collect_notes(self) -> None:
@@ -494,7 +496,7 @@ class Gateway:
 
     def close(self) -> None:
         """Finish the recording, cancel the fit, close the sessions within a time limit."""
-        self._calibration.cancel()
+        self._calibration.close()
         self._relocalization.cancel()
         self._refinement.cancel()
         self._record_steps(100_000)
