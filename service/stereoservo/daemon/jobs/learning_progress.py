@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.calibration.single_joint_fit import LOCKED_RANGE, MIN_STOPS
+from stereoservo.calibration.single_joint_fit import LOCKED_RANGE
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import Event
 from stereoservo.core.settings import CoreSettings
@@ -79,9 +79,9 @@ class Learner:
 
 def learnt_accuracy(trials: TrialData, count: int) -> LearntAccuracy:
     """Accuracy of the first ``count`` joints of an arm whose other joints stood in their ``trials`` or are left out."""
+    part = first_joints(trials, count)
     coverage = {camera.name: _coverage(trials, c) for c, camera in enumerate(trials.cameras)}
     try:
-        part = first_joints(trials, count)
         model = fit_model(part, epoch=0).model
     except CalibrationError as error:
         return LearntAccuracy(coverage=coverage, note=error.message)
@@ -96,10 +96,6 @@ def first_joints(trials: TrialData, count: int) -> TrialData:
     """The trials of the first ``count`` joints, at the stops where the others are where they were at the first stop."""
     rest = np.abs(trials.positions - trials.positions[0])[:, count:]
     stood = (rest <= LOCKED_RANGE).all(axis=1) & (trials.trials < count)
-    enough = [int((stood & (trials.trials == joint)).sum()) >= MIN_STOPS for joint in range(count)]
-    if not all(enough):
-        name = trials.joint_names[enough.index(False)]
-        raise CalibrationError("too_few_stops", f"joint {name} has too few stops with the joints after it at rest")
     return msgspec.structs.replace(
         trials,
         joint_names=trials.joint_names[:count],
