@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import msgspec
@@ -43,7 +44,7 @@ def test_what_is_known_grows_with_the_data(benches: Any, sweeps: bool) -> None:
             states.append(state)
         if count := learner.due():
             fits.append((count, learner.predict(count)))
-    for before, after in zip(states, states[1:], strict=False):
+    for before, after in pairwise(states):
         assert before.images <= after.images
         assert before.motion <= after.motion
         assert all(one.moved <= two.moved for one, two in zip(before.joints, after.joints, strict=True))

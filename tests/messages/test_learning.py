@@ -65,4 +65,4 @@ def test_a_line_is_printed_where_the_motion_or_the_accuracy_changes() -> None:
                 tell(LearningState("moving", motion, 4, 10 * motion + images, joints, predicted_px=px))
     tell(msgspec.structs.replace(MOVING, doing="fitting"))
     assert len(lines) == 4
-    assert ["joint 1", "joint 2", "joint 3"] == [line[13:20] for line in lines[:3]]
+    assert [line[13:20] for line in lines[:3]] == ["joint 1", "joint 2", "joint 3"]
