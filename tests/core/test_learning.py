@@ -15,7 +15,7 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.ipc_messages import RunPlan, save_plan
 from stereoservo.daemon.jobs.learning_progress import Learner
-from stereoservo.gateway.learning import LearningProgress
+from stereoservo.gateway.calibration_jobs import LearningProgress
 from stereoservo.messages.cell_file import check_cell
 from stereoservo.messages.goals import Calibrate, Enable
 from stereoservo.messages.learning import LearningState
@@ -82,6 +82,10 @@ def test_a_check_motion_and_what_comes_after_an_abort_are_no_calibration(benches
     progress.on_event(msgspec.structs.replace(begin, kind="calibration_aborted"))
     assert progress.state() is None
     progress.on_event(others[1])
+    assert progress.state() is None
+    # A gateway that was started later hears of a calibration that is over.
+    for event in (begin, *others):
+        progress.on_event(event, fresh=event.kind != "calibration_finished")
     assert progress.state() is None
 
 

@@ -10,9 +10,8 @@ from typing import Literal
 
 import msgspec
 
-LEAST_PX, MOST_PX = 1e-3, 10.0
-"""Predicted errors [px] at which a joint's bar is full and empty; logarithmic between."""
 BAR = 24
+"""Characters of a joint's bar."""
 
 
 class JointLearning(msgspec.Struct, frozen=True):
@@ -26,11 +25,9 @@ class JointLearning(msgspec.Struct, frozen=True):
 
     @property
     def share(self) -> float:
-        """Fraction [0, 1] of the joint's bar that is full."""
-        if self.predicted_px is None:
-            return 0.0
-        decades = math.log10(MOST_PX / max(self.predicted_px, LEAST_PX)) / math.log10(MOST_PX / LEAST_PX)
-        return max(0.0, decades)
+        """Fraction [0, 1] of the joint's bar that is full: none at 10 px, all at 0.001 px, logarithmic."""
+        px = 10.0 if self.predicted_px is None else self.predicted_px
+        return min(1.0, max(0.0, 0.25 * (1.0 - math.log10(max(px, 1e-9)))))
 
 
 class LearntAccuracy(msgspec.Struct, frozen=True):

@@ -14,7 +14,6 @@ from typing import Any
 import msgspec
 
 from stereoservo.messages.files import read_bounded
-from stereoservo.messages.learning import LearningState
 from stereoservo.messages.status import CoreStatus, Halt, Health, RefinementState, StatusHeader
 from stereoservo.messages.wire import LoopInfo, StateMessage
 
@@ -135,7 +134,6 @@ def state_message(
     notes: tuple[str, ...] = (),
     refused_messages: int = 0,
     refinement: RefinementState | None = None,
-    learning: LearningState | None = None,
     halt: Halt | None = None,
 ) -> StateMessage:
     """The state in the clients' format, with the ages of its sources at ``now_ns``.
@@ -181,7 +179,6 @@ def state_message(
         notes=(*notes, *state.notes),
         refused_messages=refused_messages,
         refinement=refinement,
-        learning=learning,
         progress=_number(status.progress),
         seconds_left=_number(status.seconds_left),
         efforts=_finite(names, status.efforts if measured else None),
