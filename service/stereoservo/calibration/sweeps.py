@@ -348,7 +348,8 @@ def _solved_timing(
         covariance = np.linalg.pinv(square[np.ix_(known, known)])
         step = covariance @ across[known]
         variance = max(squares - float(across[known] @ step), 0.0) / freedom
-        deviations[known] = np.sqrt(np.maximum(np.diag(covariance), 0.0) * variance)
+        variances = np.diag(covariance) * variance
+        deviations[known] = np.sqrt(np.where(variances >= 0.0, variances, np.inf))  # of what is not determined
         values = values.copy()
         values[known] += step
         values = np.clip(values, -LONGEST_DELAY_S, LONGEST_DELAY_S)
