@@ -149,6 +149,20 @@ def test_wrong_detections_do_not_enter_means() -> None:
     assert np.nanmax(np.abs(found.pixels - clean.pixels)) < 6.0 * SIGMA
 
 
+def test_a_marker_that_few_frames_of_a_leg_show_leaves_the_others_as_they_are() -> None:
+    cell = random_case(0).cell
+    leg = legs_of(cell, np.random.default_rng(5), np.zeros(2))[1]
+    clean = leg_means(leg, timing_of(np.zeros(2)), 4)
+    hidden = leg.pixels[0].copy()
+    hidden[:8, 1] = hidden[12:, 1] = np.nan
+    found = leg_means(msgspec.structs.replace(leg, pixels=(hidden, leg.pixels[1])), timing_of(np.zeros(2)), 4)
+    assert clean is not None
+    assert found is not None
+    assert np.isfinite(found.pixels[0, :, 1]).all(axis=-1).sum() <= 2
+    assert found.pixels[1] == pytest.approx(clean.pixels[1], nan_ok=True)
+    assert np.nanmax(np.abs(np.delete(found.pixels[0] - clean.pixels[0], 1, axis=1))) < 6.0 * SIGMA
+
+
 def test_a_leg_without_motion_or_with_few_frames_has_no_means() -> None:
     cell = random_case(0).cell
     leg = legs_of(cell, np.random.default_rng(6), np.zeros(2))[0]

@@ -30,7 +30,8 @@ def run(capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, Any]]:
     def run_it(*arguments: str) -> tuple[int, Any]:
         capfd.readouterr()
         code = cli.invoke([*arguments, "--json"])
-        return code, json.loads(capfd.readouterr().out)
+        out, run_it.said = capfd.readouterr()  # type: ignore[attr-defined]
+        return code, json.loads(out)
 
     return run_it
 
@@ -73,6 +74,11 @@ def test_check_report_and_damaged_models(
         assert len(check["history"]) == len(load_checks(directories.checks)[0]) == 1
         code, result = run("calibrate", CELL)
         assert code == 0
+        lines = [line for line in run.said.splitlines() if line.startswith("calibrating: ")]  # type: ignore[attr-defined]
+        motions = [line.split(",")[0].removeprefix("calibrating: ") for line in lines]
+        expected = [*(f"joint {k} of 6" for k in range(1, 7)), "all joints at once", "fitting the model"]
+        assert list(dict.fromkeys(motions))[-8:] == expected
+        assert client.status().learning is None
         assert result["epoch"] == 91
         assert result["covariance_ok"]
         assert result["grade"] == "good"

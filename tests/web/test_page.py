@@ -16,6 +16,7 @@ import pytest
 pytest.importorskip("websockets", reason="the page's server needs websockets (extra web)")
 
 from stereoservo.daemon.preview import encode_jpeg
+from stereoservo.messages.learning import JointLearning, LearningState
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Halt, Health
 from stereoservo.messages.wire import (
@@ -242,3 +243,25 @@ def test_a_model_that_no_camera_sees_is_not_green_and_silent_cameras_are_named(c
     chrome.value(f"{TEXT.format('reasons')}.includes('CAMERA_SILENT left: its process has ended')")
     assert chrome.run("return document.getElementById('model').className") == "badge warn"
     assert chrome.run("return document.getElementById('lifecycle').className") == "badge warn"
+
+
+def test_while_the_arm_is_learnt_a_tile_a_joint_fills_with_its_accuracy(cell: LiveCell, chrome: Browser) -> None:
+    hidden = "document.getElementById('learning').hidden"
+    fills = (
+        "[...document.querySelectorAll('#learning-joints li')].map((tile) => tile.style.getPropertyValue('--known'))"
+    )
+    assert chrome.run(f"return {hidden}")
+    tiles = (JointLearning("j1", 0.5, 0.1), JointLearning("j2", 0.4), JointLearning("j3"))
+    learning = LearningState("moving", 2, 4, 118, tiles, 7.2, 0.12, {"left": 0.25})
+    cell.state = msgspec.structs.replace(STATE, learning=learning)
+    chrome.value(f"!{hidden} && {TEXT.format('learning-head')} !== ''")
+    assert chrome.run(f"return {TEXT.format('learning-head')}") == "Learning the arm: joint 2 of 3, predicted 0.12 px"
+    assert chrome.run(f"return {TEXT.format('learning-count')}") == "118 images, 25 % of left seen, 7 s left"
+    assert chrome.run(f"return {fills}") == ["50%", "0%", "0%"]
+    texts = chrome.element("#learning-joints").text
+    assert texts.split("\n") == ["j1: 0.10 px", "j2: not known yet", "j3: not moved yet"]
+    assert chrome.run("return document.querySelector('#learning-joints .now').textContent").startswith("j2")
+    cell.state = msgspec.structs.replace(STATE, learning=msgspec.structs.replace(learning, doing="fitting", motion=4))
+    chrome.value(f"{TEXT.format('learning-head')}.includes('fitting the model')")
+    cell.state = STATE
+    chrome.value(hidden)

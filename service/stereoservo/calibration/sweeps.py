@@ -348,7 +348,8 @@ def _solved_timing(
         covariance = np.linalg.pinv(square[np.ix_(known, known)])
         step = covariance @ across[known]
         variance = max(squares - float(across[known] @ step), 0.0) / freedom
-        deviations[known] = np.sqrt(np.diag(covariance) * variance)
+        variances = np.diag(covariance) * variance
+        deviations[known] = np.sqrt(np.where(variances >= 0.0, variances, np.inf))  # of what is not determined
         values = values.copy()
         values[known] += step
         values = np.clip(values, -LONGEST_DELAY_S, LONGEST_DELAY_S)
@@ -420,7 +421,7 @@ def _slopes(
     """Derivatives (f, k) of the polynomials that describe ``tracks`` (f, k), by the position ``links`` (f,)."""
     coefficients, *_ = np.linalg.lstsq(columns, tracks, rcond=None)
     derivative = np.polynomial.chebyshev.chebder(coefficients[:terms])
-    return np.asarray(_columns(links, low, high, terms - 1) @ derivative * (2.0 / max(high - low, 1e-12)))
+    return np.asarray(_columns(links, low, high, max(terms - 1, 1)) @ derivative * (2.0 / max(high - low, 1e-12)))
 
 
 def _at_one_time(pixels: FloatArray, along: FloatArray, speed: FloatArray, row_s: float, height: int) -> FloatArray:

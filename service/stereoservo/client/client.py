@@ -10,7 +10,7 @@ import itertools
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any, Literal, TypedDict, Unpack
 
 import msgspec
@@ -45,6 +45,7 @@ from stereoservo.messages.goals import (
     TaughtTarget,
     Teach,
 )
+from stereoservo.messages.learning import LearningState
 from stereoservo.messages.wire import (
     CalibrationResult,
     CellInfo,
@@ -261,14 +262,18 @@ class Client(Connection):
         *,
         report: bool = False,
         lease_s: float | None = 5.0,
+        learning: Callable[[LearningState], None] | None = None,
     ) -> CalibrationResult:
-        """Calibrate the cell. ``progress`` is called with each event of the calibration. ``report``: wait for the
-        report, too.
+        """Calibrate the cell. ``progress`` is called with each event of the calibration, ``learning`` with its state
+        as it is published. ``report``: wait for the report, too.
 
         The motion has a lease that this client renews (``lease_s=None``: none): if the client dies, the motion stops.
         Raises RefusedError, FailedError (``code``: of the failed fit, or of the reason that ended the motion).
         """
-        return calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
+        with ExitStack() as watched:
+            if learning is not None:
+                watched.enter_context(_watched_learning(self, learning))
+            return calibrate(self, progress, timeout_s, report=report, lease_s=lease_s)
 
     def check_model(
         self,
@@ -353,6 +358,29 @@ def with_newest_markers(arrived: list[tuple[str, Any, type[Any]]]) -> list[tuple
 
 
 REPORT_TIMEOUT_S = 120.0
+
+
+@contextmanager
+def _watched_learning(connection: Connection, learning: Callable[[LearningState], None]) -> Iterator[None]:
+    """Call ``learning`` with the newest progress of the calibration that is published during waits."""
+    subscriber = connection.session.declare_subscriber(connection.keys.state, RingChannel(1))
+    before = connection.while_waiting
+
+    def look() -> None:
+        before()
+        if (sample := subscriber.try_recv()) is not None:
+            state = read_message(str(sample.key_expr), sample.payload.to_bytes(), StateMessage)
+            if state.learning is not None:
+                learning(state.learning)
+
+    connection.while_waiting = look
+    try:
+        yield
+    finally:
+        connection.while_waiting = before
+        subscriber.undeclare()
+
+
 Progress = Callable[[EventMessage], None]
 
 

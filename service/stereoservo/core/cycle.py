@@ -139,6 +139,10 @@ class PathRecord(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
     leg: int = 0
 
 
+TRIALS_BEGIN = "trial motions begin"
+"""Message of the event `calibration_progress` with which a calibration begins, and not a check motion."""
+
+
 class Event(msgspec.Struct, frozen=True, eq=False):
     """A message that a client must not miss. ``seq`` counts from the core's start; ``t_ns`` monotonic."""
 

@@ -6,7 +6,9 @@ shared-memory slots.
 from __future__ import annotations
 
 import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import BinaryIO
 
 import msgspec
 import numpy as np
@@ -252,6 +254,28 @@ def unpack_step_message(data: bytes) -> StepMessage:
         return message
     _, lost, t_ns = _STEP.unpack_from(data)
     return RecordedStep(t_ns, data[_STEP.size :], lost)
+
+
+_EVENT_LENGTH = struct.Struct("<I")
+
+
+def store_event(file: BinaryIO, event: Event) -> None:
+    """Append an event of the core to ``file``."""
+    data = encode(event)
+    file.write(_EVENT_LENGTH.pack(len(data)) + data)
+
+
+def stored_events(file: BinaryIO) -> Iterator[Event]:
+    """The events in ``file`` from its position on; one that is still being written is left for the next call."""
+    while True:
+        at = file.tell()
+        head = file.read(_EVENT_LENGTH.size)
+        size = _EVENT_LENGTH.unpack(head)[0] if len(head) == _EVENT_LENGTH.size else 0
+        data = file.read(size)
+        if not size or len(data) < size:
+            file.seek(at)
+            return
+        yield event_decoder.decode(data)
 
 
 class PlanError(DamagedError):

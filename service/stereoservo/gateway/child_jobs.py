@@ -44,6 +44,8 @@ class FitProgress(msgspec.Struct, frozen=True):
 class ChildJob:
     """A child process that prints JSON objects, one per line. ``said`` holds all of them except progress."""
 
+    timeout_s = FIT_TIMEOUT_S
+
     def __init__(self, module: str, *arguments: str) -> None:
         self._started = time.monotonic()
         self._errors: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - read when the process has ended
@@ -84,8 +86,8 @@ class ChildJob:
 
     @property
     def ended(self) -> bool:
-        """Whether the process has ended (it is killed after ``FIT_TIMEOUT_S``)."""
-        if self.seconds > FIT_TIMEOUT_S:
+        """Whether the process has ended (it is killed after ``timeout_s``)."""
+        if self.seconds > self.timeout_s:
             self.cancel()
         return self._process.poll() is not None
 

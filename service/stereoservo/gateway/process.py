@@ -75,6 +75,7 @@ from stereoservo.messages.directories import CellDirectories, DirectoryError
 from stereoservo.messages.discovery import DaemonInfo
 from stereoservo.messages.files import write_atomically
 from stereoservo.messages.keys import VERBS, KeySpace
+from stereoservo.messages.learning import LearningState
 from stereoservo.messages.reasons import Level, Reason
 from stereoservo.messages.run_record import read_run
 from stereoservo.messages.servo_state import silence_limit_s, state_message
@@ -150,6 +151,7 @@ class Gateway:
             self.log,
             directories.checks,
             "" if plan.cell.calibration is None else plan.cell.calibration.known_length,
+            directories.runtime,
         )
         self._relocalization = RelocalizationJobs(
             self._models, self._servo, self.log, lambda: self._calibration.model, self._use_model
@@ -438,6 +440,7 @@ class Gateway:
             notes=(*self._calibration.notes, *self._notes.texts),
             refused_messages=self._intake.boundary.refusals.count + self._stop.refused,
             refinement=self._refinement.state(),
+            learning=self._calibration.learning.state(),
         )
 
     def _collect_notes(self) -> None:
@@ -494,7 +497,7 @@ class Gateway:
 
     def close(self) -> None:
         """Finish the recording, cancel the fit, close the sessions within a time limit."""
-        self._calibration.cancel()
+        self._calibration.close()
         self._relocalization.cancel()
         self._refinement.cancel()
         self._record_steps(100_000)
@@ -608,9 +611,9 @@ class CellState:
         """
         self._halt.take(event, operator, repeated=repeated)
 
-    def message(self, **fields: Any) -> StateMessage | None:
-        """The current state in the clients' format, with the further arguments ``fields`` of `state_message`; None
-        before the first state.
+    def message(self, learning: LearningState | None = None, **fields: Any) -> StateMessage | None:
+        """The current state in the clients' format, with the progress of a calibration and the further arguments
+        ``fields`` of `state_message`; None before the first state.
         """
         if self.newest is None:
             return None
@@ -626,6 +629,7 @@ class CellState:
             reasons=(*state.reasons, *silent),
             level="slow" if state.level == "ok" and any(r.level == "slow" for r in silent) else state.level,
             halt=self._halt.now if halted else None,
+            learning=learning,
         )
 
     def close(self) -> None:

@@ -36,6 +36,7 @@ from stereoservo.messages.goals import (
     Teach,
     UpdateGoal,
 )
+from stereoservo.messages.learning import LearningState
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.recording_request import ImagesRecorded
 from stereoservo.messages.status import Halt, Health, RefinementState, StatusHeader
@@ -223,6 +224,8 @@ class StateMessage(StatusHeader, frozen=True):
     """Messages that the gateway has rejected since its start: not JSON, of a wrong shape, on a wrong key."""
     refinement: RefinementState | None = None
     """With `[calibration] refine`; None: there is no on-line refinement."""
+    learning: LearningState | None = None
+    """Progress of the calibration that is running; None: there is none."""
     joints_age_s: float | None = None
     """Age of the newest joint sample [s]; None: there was none yet."""
     camera_age_s: dict[str, float | None] = msgspec.field(default_factory=dict)

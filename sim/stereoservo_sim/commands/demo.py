@@ -18,6 +18,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.learning import LearningLines, tenths
 from stereoservo_sim.cells import CELLS, shipped_cell_path
 from stereoservo_sim.demonstration.emulated import (
     has_emulated_cameras,
@@ -136,9 +137,9 @@ def _telling() -> Iterator[DemonstrationProgress]:
     console = Console(stderr=True)
     if not console.is_terminal:
         tell_line = _line(console)
-        yield DemonstrationProgress(tell=tell_line, progress=tenths(tell_line))
+        yield DemonstrationProgress(tell_line, tenths(tell_line), LearningLines(tell_line))
         return
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task("stereoservo demo", total=1.0)
 
@@ -146,24 +147,11 @@ def _telling() -> Iterator[DemonstrationProgress]:
             bar.console.print(text, highlight=False, soft_wrap=True)
             bar.update(task, description=text[:60])
 
-        yield DemonstrationProgress(tell=tell, progress=lambda fraction: bar.update(task, completed=fraction))
-
-
-def tenths(tell: Callable[[str], None]) -> Callable[[float], None]:
-    """Callback for the completed fraction of a task: ``tell`` gets a line at each tenth, and again where one task ends
-    and the next begins.
-    """
-    reported = 0
-
-    def progress(fraction: float) -> None:
-        nonlocal reported
-        tenth = int(10.0 * fraction + 1e-9)
-        if tenth != reported:
-            reported = tenth
-            if tenth:
-                tell(f"  {10 * tenth} %")
-
-    return progress
+        yield DemonstrationProgress(
+            tell,
+            lambda fraction: bar.update(task, completed=fraction),
+            lambda state: bar.update(task, description=state.picture),
+        )
 
 
 def _line(console: Console) -> Callable[[str], None]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from stereoservo.messages.learning import LearningState
+
 
 class DemoFailedError(Exception):
     """The demonstration did not succeed."""
@@ -12,7 +14,10 @@ class DemoFailedError(Exception):
 
 @dataclass(frozen=True)
 class DemonstrationProgress:
-    """Protocol of a progress reporter: lines of text, and the completed fraction of the current work."""
+    """Protocol of a progress reporter: lines of text, the completed fraction of the current work, and what a
+    calibration has learnt so far.
+    """
 
     tell: Callable[[str], None]
     progress: Callable[[float], None]
+    learning: Callable[[LearningState], None] = lambda _: None

@@ -22,6 +22,7 @@ from stereoservo.messages.cell_file import CellFile, load_cell_file
 from stereoservo.messages.directories import RUNTIME_VARIABLE, STATE_VARIABLE, cell_directories
 from stereoservo.messages.discovery import DaemonProcess
 from stereoservo.messages.goals import JointTarget, LawName
+from stereoservo.messages.learning import LearningState
 from stereoservo.messages.wire import EventMessage, FeaturesMessage, LoopInfo
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo_sim.demonstration.belt import Belt
@@ -181,7 +182,7 @@ def conduct_live(
             with Client(cell.cell.name) as client:
                 names = tuple(joint.name for joint in client.info().joints)
                 calibrated, outcomes = perform(
-                    LiveDemonstrator(client, stage.progress, stage.tell),
+                    LiveDemonstrator(client, stage.progress, stage.tell, stage.learning),
                     names,
                     configurations,
                     stage.tell,
@@ -244,10 +245,12 @@ class LiveDemonstrator:
         client: Client,
         progress: Callable[[float], None],
         tell: Callable[[str], None] = lambda text: None,
+        learning: Callable[[LearningState], None] | None = None,
     ) -> None:
         self._client = client
         self._progress = progress
         self._tell = tell
+        self._learning = learning
         self._looked_s = time.monotonic()
         self._holds = self._looks = 0
         client.while_waiting = self._look
@@ -261,7 +264,7 @@ class LiveDemonstrator:
         while True:
             start = time.monotonic()
             try:
-                result = self._client.calibrate(self._hear)
+                result = self._client.calibrate(self._hear, learning=self._learning)
             except FailedError as error:
                 if not self._goes_on(error.code in BUSY_COMPUTER, str(error)):
                     raise

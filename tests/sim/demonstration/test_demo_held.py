@@ -115,7 +115,7 @@ class StoppedCell:
     def wait(self) -> StoppedCell:
         return self
 
-    def calibrate(self, progress: Any) -> Any:
+    def calibrate(self, progress: Any, learning: Any) -> Any:
         if self.left:
             event: Any = SimpleNamespace(
                 kind="calibration_aborted", name="", message=self.message, reasons=self.reasons

@@ -1,6 +1,6 @@
 """Progress of a demonstration that is not on a terminal: lines that a person can follow."""
 
-from stereoservo_sim.commands.demo import tenths
+from stereoservo.messages.learning import tenths
 
 
 def test_each_tenth_is_a_line_and_the_next_task_begins_again():

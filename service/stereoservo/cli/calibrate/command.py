@@ -8,7 +8,6 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -32,6 +31,7 @@ from stereoservo.client import Client, FailedError
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.directories import cell_directories
 from stereoservo.messages.discovery import DaemonProcess, NotRunningError, find_daemon
+from stereoservo.messages.learning import LearningLines, tenths
 from stereoservo.messages.wire import CalibrationResult, EventMessage
 
 TRIALS_SHARE = 0.9
@@ -213,12 +213,18 @@ def _calibrate_live(given: CalibrateOptions, options: CellOptions) -> None:
                 _reset_zeros(client, options.json)
                 return
             if given.check:
-                report = _with_bar(client, "check motion", partial(client.check_model, quick=given.quick))
+                report = _with_bar(
+                    client, "check motion", lambda progress, _: client.check_model(progress, quick=given.quick)
+                )
                 _print_check(report, client.cell, options.endpoint, options.json)
                 if given.unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)
                 return
-            result = _with_bar(client, "trial motions", lambda progress: client.calibrate(progress, report=True))
+            result = _with_bar(
+                client,
+                "trial motions",
+                lambda progress, learning: client.calibrate(progress, report=True, learning=learning),
+            )
         except KeyboardInterrupt:
             client.stop()
             raise
@@ -278,31 +284,24 @@ def _must_be_idle(client: Client) -> None:
 
 
 def _with_bar(client: Client, what: str, run: Any) -> Any:
+    """Result of ``run``, called with handlers of events and of learning states: a bar with a picture of what is learnt
+    on a terminal, lines elsewhere; both on stderr.
+    """
     console = Console(file=sys.stderr)
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         TextColumn("{task.percentage:>3.0f} %"),
         TimeElapsedColumn(),
     )
     if not console.is_terminal:
-        return run(_telling(client.cell, _lines(what)))
+        return run(_telling(client.cell, tenths(log, f"{what}:")), LearningLines(log))
     with Progress(*columns, console=console) as bar:
         task = bar.add_task(what, total=1.0)
-        return run(_telling(client.cell, lambda done, told: bar.update(task, completed=done, description=told or what)))
-
-
-def _lines(what: str) -> Callable[[float, str], None]:
-    """Progress as plain lines on stderr, one each tenth."""
-    said = -1
-
-    def tell(done: float, told: str) -> None:
-        nonlocal said
-        if int(10 * done) > said:
-            said = int(10 * done)
-            log(f"{what}: {100 * done:.0f} %{f': {told}' if told else ''}")
-
-    return tell
+        return run(
+            _telling(client.cell, lambda done, told: bar.update(task, completed=done, description=told or None)),
+            lambda state: bar.update(task, description=state.picture),
+        )
 
 
 def _telling(cell: str, tell: Callable[[float, str], None]) -> Callable[[EventMessage], None]:
@@ -353,7 +352,7 @@ def _reset_zeros(client: Client, json: bool) -> None:
     """
     checks: list[CheckReport] = []
 
-    def reset(progress: Callable[[EventMessage], None]) -> ZeroReset:
+    def reset(progress: Callable[[EventMessage], None], _: object) -> ZeroReset:
         def on_event(event: EventMessage) -> None:
             if event.check is not None:
                 checks.append(event.check)

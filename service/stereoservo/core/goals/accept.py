@@ -12,6 +12,7 @@ from typing import Any, cast
 import numpy as np
 
 from stereoservo.core.context import RefusalError, StepContext, no_model
+from stereoservo.core.cycle import TRIALS_BEGIN
 from stereoservo.core.goals.execute import (
     begin,
     drop_lookahead_plan,
@@ -492,7 +493,7 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
     visiting: CheckMotion | TrialMotion
     if not command.check:
         begin = start_sweeps if context.settings.trials.sweeps else start_trials
-        visiting, what = begin(command.id, context.q, context.now_ns, context.settings), "trial motions begin"
+        visiting, what = begin(command.id, context.q, context.now_ns, context.settings), TRIALS_BEGIN
     elif state.model is None:
         raise no_model(context, "the cell has no model to check: calibrate first")
     else:

@@ -214,6 +214,7 @@ function showState({ state: s, predicted, scene: shape, refinement }) {
     $("reasons").dataset.shown = texts.join("\n");
     $("reasons").replaceChildren(...(texts.length ? texts : ["none"]).map((text) => Object.assign(document.createElement("li"), { textContent: text })));
   }
+  showLearning(s.learning);
   $("refinement").textContent = refinement ? `Refinement: ${refinement}` : ""; // a flight tells none
   $("refinement").hidden = !refinement;
   for (const v of views.values()) {
@@ -230,6 +231,27 @@ function showState({ state: s, predicted, scene: shape, refinement }) {
   history.loop.push([t, s.loop.lateness_us.p99 ?? null]);
   history.reasons.push([t, s.reasons.map((r) => r.code)]);
   for (const rows of Object.values(history)) if (rows.length > 1300) rows.splice(0, rows.length - 1300);
+}
+
+function showLearning(l) {
+  // A tile a joint, empty at 10 px and full at 0.001 px of predicted error; the text says the same.
+  $("learning").hidden = !l;
+  if (!l) return;
+  const px = (x) => `${x.toPrecision(2)} px`, n = l.motions - 1;
+  const motion = l.doing === "fitting" ? "fitting the model" : !l.motion ? "to the base" : l.motion > n ? "all joints at once" : `joint ${l.motion} of ${n}`;
+  const known = l.predicted_px === null ? `accuracy not known yet${l.note && `: ${l.note}`}` : `predicted ${px(l.predicted_px)}`;
+  const seen = Object.entries(l.coverage).map(([camera, share]) => `, ${Math.round(100 * share)} % of ${camera} seen`).join("");
+  const head = `Learning the arm: ${motion}, ${known}`; // a screen reader says what changes
+  if ($("learning-head").textContent !== head) $("learning-head").textContent = head;
+  const left = l.seconds_left === null ? "" : `, ${l.seconds_left.toFixed(0)} s left`;
+  $("learning-count").textContent = `${l.images} images${seen}${left}`;
+  $("learning-joints").replaceChildren(...l.joints.map((joint, k) => {
+    const p = joint.predicted_px, item = document.createElement("li");
+    item.textContent = `${joint.name}: ${p !== null ? px(p) : joint.moved ? "not known yet" : "not moved yet"}`;
+    item.className = l.doing === "moving" && (k + 1 === l.motion || l.motion > n) ? "now" : "";
+    item.style.setProperty("--known", p === null ? "0%" : `${Math.min(100, Math.max(0, 25 * (1 - Math.log10(p))))}%`);
+    return item;
+  }));
 }
 
 function showHead() {
