@@ -37,7 +37,8 @@ LEAST_MOTION = 2e-3
 """Motion of a joint [rad or m] on a leg from which its play is taken up."""
 STRAIGHT = 1e-3
 """Largest deviation of a joint from a leg's line, as a fraction of half the leg, in a frame that is used."""
-SMOOTHED_S = 0.1
+SMOOTHING = 3.5
+"""Span [s] of the quadratic that smooths readings of 1 rad, sampled once a second."""
 ROUNDS = 12
 LONGEST_DELAY_S = 0.3
 CONVERGED = 1e-6
@@ -82,8 +83,22 @@ class Leg(msgspec.Struct, frozen=True, eq=False):
     heights: tuple[int, ...]
 
     def positions_at(self, times: FloatArray) -> FloatArray:
-        """Joint positions (f, n) at ``times`` (f,) [s], by linear interpolation."""
-        return np.array([np.interp(times, self.joint_times, q) for q in self.positions.T]).T
+        """Joint positions (f, n) at ``times`` (f,) [s], by the cubic through four samples; before the first and after
+        the last sample, where it was.
+        """
+        knots = self.joint_times
+        if len(knots) < 4:
+            return np.array([np.interp(times, knots, q) for q in self.positions.T]).T
+        inside = np.clip(times, knots[0], knots[-1])
+        first = np.clip(np.searchsorted(knots, inside, side="right") - 2, 0, len(knots) - 4)
+        around = first[:, None] + np.arange(4)
+        apart = inside[:, None] - knots[around]
+        found = np.zeros((len(times), self.positions.shape[1]))
+        for k in range(4):
+            others = [o for o in range(4) if o != k]
+            weight = np.prod(apart[:, others] / (knots[around[:, [k]]] - knots[around[:, others]]), axis=1)
+            found += weight[:, None] * self.positions[around[:, k]]
+        return found
 
     @property
     def ends(self) -> FloatArray:
@@ -189,16 +204,21 @@ def links_displaced(legs: list[Leg], play: FloatArray) -> list[FloatArray]:
 def smoothed_readings(
     times: FloatArray, positions: FloatArray, resolution: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Joint samples at even times, of joints read in steps of ``resolution`` (n,) by a quadratic over `SMOOTHED_S`: one
-    that passes many steps in that time is known far better than to one of them.
+    """Joint samples at even times, those of joints read in coarse steps of ``resolution`` (n,) smoothed by a quadratic:
+    a joint that passes many steps is known far better than to one of them.
+
+    Its span balances quantization, ``0.4 resolution √(period / span)``, against what the quadratic errs where an
+    acceleration of some rad/s² begins, ``0.01 span²``; the latter is rare.
     """
-    half = int(0.5 * SMOOTHED_S / max(float(np.median(np.diff(times))), 1e-4))
-    if not resolution.any() or half < 2:
+    period = max(float(np.median(np.diff(times))), 1e-4)
+    halves = (0.5 * SMOOTHING * (resolution * np.sqrt(period)) ** 0.4 / period).astype(np.int64)
+    if halves.max() < 2:
         return times, positions
     even = np.linspace(times[0], times[-1], len(times))
-    weights = np.linalg.pinv(np.vander(np.linspace(-1.0, 1.0, 2 * half + 1), 3, increasing=True))[0]
     found = np.array([np.interp(even, times, q) for q in positions.T]).T
-    for joint in np.flatnonzero(resolution):
+    for joint in np.flatnonzero(halves >= 2):
+        half = int(halves[joint])
+        weights = np.linalg.pinv(np.vander(np.linspace(-1.0, 1.0, 2 * half + 1), 3, increasing=True))[0]
         around = np.pad(found[:, joint], half, mode="edge")
         found[:, joint] = np.convolve(around, weights, mode="valid")
     return even, found
