@@ -179,6 +179,18 @@ def _arrival(resolution: tuple[float, ...], joints: int) -> FloatArray:
     return tolerance
 
 
+MIN_MARKERS = 3
+"""Number of markers that determine the pose of a free body."""
+RIGID_FREEDOMS = 6
+
+
+def fewest_markers(joints: int) -> int:
+    """Least number of markers that a goal has to show. For an arm of fewer than six joints fewer are sufficient,
+    because the goal must be reachable.
+    """
+    return MIN_MARKERS if joints >= RIGID_FREEDOMS else 1
+
+
 def core_settings(
     cell: CellFile,
     joints: JointDriverDescription,

@@ -8,9 +8,8 @@ from pathlib import Path
 
 from stereoservo.calibration.fit_assessment import assess_failure
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.core.cycle import Event
+from stereoservo.core.cycle import RESET_ZEROS, Event
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.check import RESET_ZEROS
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import CheckJob, FitFailedError, FitJob, calibration_result
 from stereoservo.gateway.persistence import ModelStore

@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS, OPTIONS, UnknownLawError
-from stereoservo.core.goals.marker_body import fewest_markers
-from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.settings import MIN_MARKERS, CameraSettings, CoreSettings, fewest_markers
 from stereoservo.messages.goals import (
     AdaptiveGain,
     AuxiliarySpec,
@@ -264,7 +263,6 @@ def _as_json(value: object) -> str:
 __all__ = ["GoalContext", "check_command", "check_goal"]
 
 
-MIN_MARKERS = 3
 POINTS_OF = {"point": 1, "line": 2, "plane": 3}
 SINGULAR = 1e-12
 """Least singular value of a displacement relative to its largest."""

@@ -17,7 +17,6 @@ from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
     LAW_STEPS,
     MAX_GOAL_RESIDUAL_PX,
-    MIN_MARKERS,
     REFINEMENTS,
     BodyState,
     GoalPose,
@@ -26,7 +25,6 @@ from stereoservo.core.goals.marker_body import (
     displacement_by_law,
     enough_in_view,
     enough_shown,
-    fewest_markers,
     in_front,
     keeps_its_shape,
     mirrored,
@@ -38,7 +36,7 @@ from stereoservo.core.goals.marker_body import (
 )
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
-from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.settings import MIN_MARKERS, CameraSettings, CoreSettings, fewest_markers
 from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
     invert4,
