@@ -61,7 +61,7 @@ def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
             return process.wait(REPORT_EVERY_S)
         except subprocess.TimeoutExpired:
             progress = read_progress(told)
-        if progress != known:
+        if progress and progress != known:
             known = progress
             log(f"compiling: {progress[0].text}")
 
