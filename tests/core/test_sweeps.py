@@ -12,9 +12,11 @@ from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state_encoding import decode_state, encode_state
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
+from stereoservo.kinematics.covariance import pixel_covariances
 from stereoservo.messages.goals import Calibrate, Enable
 
 GOAL = "00000011"
+COUNT = 2.0 * np.pi / 4096
 ENDS = ("calibration_finished", "calibration_aborted")
 
 
@@ -110,3 +112,65 @@ def test_the_state_of_sweeps_survives_encoding(bench: Any) -> None:
     copy = decode_state(encode_state(state))
     assert type(copy.source) is type(state.source)
     assert encode_state(copy) == encode_state(state)
+
+
+def jitter_stamps(bench: Any, rng: np.random.Generator) -> None:
+    """Let the stamps of the frames deviate by a millisecond."""
+    shutter = bench._shutter
+
+    def jittered() -> None:
+        before = len(bench.pending)
+        shutter()
+        for k in range(before, len(bench.pending)):
+            stamped = bench.pending[k].t_shutter_ns + round(rng.normal(0.0, 1e6))
+            bench.pending[k] = msgspec.structs.replace(bench.pending[k], t_shutter_ns=stamped)
+
+    bench._shutter = jittered
+
+
+@pytest.mark.parametrize("jitters", [False, True])
+def test_the_arm_stops_where_stamps_are_not_exact(benches: Any, jitters: bool) -> None:
+    bench = sweeping(benches(2, noise_px=0.05), range=np.full(6, 0.3))
+    if jitters:
+        jitter_stamps(bench, np.random.default_rng(2))
+    end, chunks = calibrated(bench, 300.0)
+    assert end.kind == "calibration_finished", end
+    said = [e.message for e in bench.events if e.kind == "warning" and "stamps of camera" in e.message]
+    assert len(said) == (1 if jitters else 0), said
+    collector = TrialCollector(bench.settings)
+    for event in bench.events:
+        collector.add(event)
+    assert chunks
+    assert (collector.stops > 10) == jitters
+    assert (collector.frames == 0) == jitters
+    assert fit_model(collector.trials(), epoch=1).model.stratum == "metric"
+
+
+def test_coarse_encoders_are_known_better_by_sweeps_than_at_stops(benches: Any) -> None:
+    """A joint at rest is within a step; one that passes many of them is known to a fraction of a step."""
+    errors = {}
+    for sweeps in (True, False):
+        bench = sweeping(benches(2, noise_px=0.05), range=np.full(6, np.nan), frames=5, stops=9)
+        trials = msgspec.structs.replace(bench.settings.trials, sweeps=sweeps)
+        bench.settings = msgspec.structs.replace(bench.settings, trials=trials, resolution=(COUNT,) * 6)
+        bench.core = ServoCore(bench.settings)
+        bench.resolution = COUNT
+        start_ns = bench.now_ns
+        end, _ = calibrated(bench, 300.0)
+        assert end.kind == "calibration_finished", end
+        seconds = 1e-9 * (bench.now_ns - start_ns)
+        collector = TrialCollector(bench.settings)
+        for event in bench.events:
+            collector.add(event)
+        model = fit_model(collector.trials(), epoch=1).model
+        assert model.statistics is not None
+        assert model.statistics.chi2_ok
+        held = bench.settings.trials.base + np.random.default_rng(5).uniform(-0.25, 0.25, (40, 6))
+        found, covariances = pixel_covariances(model, held)
+        exact = np.array([bench.truth.pixels(q) for q in held]).transpose(1, 0, 2, 3)
+        errors[sweeps] = float(np.sqrt(((found - exact) ** 2).mean()))
+        stated = float(np.sqrt(0.5 * np.trace(covariances, axis1=-2, axis2=-1).mean()))
+        kind = "sweeps" if sweeps else "stops"
+        print(f"{kind}: {seconds:.0f} s, held-out error {errors[sweeps]:.3f} px, stated {stated:.3f} px")
+        assert errors[sweeps] < 2.0 * stated
+    assert errors[True] < errors[False]

@@ -169,7 +169,7 @@ def refuse_poor_fit(
         )
     factor = float(np.sqrt(solution.statistics.variance))
     if factor > options.max_sigma_factor:
-        squares = (solution.residuals.reshape(-1, 2) ** 2).sum(axis=1)
+        squares = (residuals(solution.rig, data).reshape(-1, 2) ** 2).sum(axis=1)
         of_stop = trials.trials[data.stop]
         per_joint = {
             name: float(np.sqrt(squares[of_stop == j].mean() / 2))

@@ -25,8 +25,6 @@ from stereoservo.ports.devices import CameraDescription, JointDriverDescription,
 
 FINEST_ARRIVAL = 5e-4
 """Smallest distance to its target [rad or m] within which a joint has arrived, however fine its encoder."""
-COARSE = 2e-4
-"""Resolution of an encoder [rad or m] above which trial motions stop for measurements."""
 ARRIVAL_STEPS = 0.75
 """The same for coarse encoders, in encoder steps: some reading is always within half a step of a target."""
 SLACK = 1e-3  # tolerance of a cell's limits beyond the drive's, for rounding [rad or m]
@@ -379,7 +377,6 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
     assert section is not None
     names = tuple(joint.name for joint in joints.joints)
     spread_joint, offsets = -1, np.zeros(1)
-    coarsest = max(joint.resolution for joint in joints.joints)
     if section.spread is not None:
         spread = section.spread
         spread_joint = names.index(spread.joint)
@@ -408,5 +405,5 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         together=section.together if len(names) > 1 else 0,
         spread_joint=spread_joint,
         spread_offsets=offsets,
-        sweeps=section.motion == "sweeps" and section.spread is None and coarsest <= COARSE,
+        sweeps=section.motion == "sweeps" and section.spread is None,
     )

@@ -270,7 +270,8 @@ class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):
     base; ``corner``: combinations of offsets tried; ``leg``: number of the sweep, of joint ``trial`` or of all, -1.
     ``base_pixels``, ``last`` (c, m, 2) [px]: markers at the base and in each camera's last frame, at ``last_ns`` (c,),
     with ``rates`` (c, m, 2) [px/s].
-    ``arrived_ns``: since when it rests at the base after the last sweep, 0: not yet.
+    ``stamp_sums`` (c, 2): scatter of each camera's stamps (`calibration.sweeps.stamp_scatter`), weighted by the number
+    of frames, and that number. ``arrived_ns``: since when it rests at the base after the last sweep, 0: not yet.
     """
 
     joint: int
@@ -281,6 +282,7 @@ class SweepMotion(TrialMotion, tag="sweeps", eq=False, kw_only=True):
     trial: int
     last_ns: IntArray
     rates: FloatArray
+    stamp_sums: FloatArray
     arrived_ns: int = 0
 
 

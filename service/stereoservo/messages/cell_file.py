@@ -168,10 +168,8 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
 
     base: dict[str, float] = {}
     range: dict[str, Positive] = {}
-    motion: Literal["sweeps", "stops"] = "stops"
-    """Joints stop for each measurement, or sweep while cameras with exact stamps run. With ``spread``, or an encoder
-    coarser than 0.2 mrad (0.2 mm), they stop.
-    """
+    motion: Literal["sweeps", "stops"] = "sweeps"
+    """Joints stop for each measurement, or sweep while cameras with exact stamps run. With ``spread`` they stop."""
     stops: Annotated[int, Meta(ge=4, le=200)] = 9
     frames: Annotated[int, Meta(ge=1, le=200)] = 5
     settle_s: NonNegative = 0.15

@@ -1,4 +1,4 @@
-"""The arm's motion in a flight recording: joint positions over time, and the intervals at rest."""
+"""The arm's motion in a flight recording: joint positions over time, intervals at rest, and straight motions."""
 
 from __future__ import annotations
 
@@ -19,6 +19,12 @@ from stereoservo.recording.step_layout import StepRecord, decode_step
 
 SPEED_OVER_NS = 50_000_000
 """Interval [ns] over which joint speeds are computed as differences: encoders do not resolve shorter ones."""
+STRAIGHT, ALONE = 0.999, 0.9995
+"""Least cosine between directions of motion, one interval apart, on a straight line in joint space; and least share of
+one joint in a direction that counts as this joint moving alone.
+"""
+SHORTEST_NS = 300_000_000
+"""Least duration [ns] of a straight motion."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,15 @@ class RestInterval:
     begin_ns: int
     settled_ns: int
     end_ns: int
+
+
+@dataclass(frozen=True)
+class StraightMotion:
+    """A motion on a straight line in joint space, of ``joint`` alone, or of several: -1."""
+
+    begin_ns: int
+    end_ns: int
+    joint: int
 
 
 @dataclass(frozen=True)
@@ -126,6 +141,30 @@ def rest_intervals(motion: RecordedMotion, settle_s: float) -> list[RestInterval
             found.append(RestInterval(int(now[begin]), int(now[settled]), int(now[k - 1])))
         elif k < count and still[k]:
             k += 1
+    return found
+
+
+def straight_motions(motion: RecordedMotion) -> list[StraightMotion]:
+    """Straight motions in order; only those after the last calibration's start, if there was one."""
+    first = max(int(motion.joint_ns[0]), motion.calibration_ns)
+    times = np.arange(first, int(motion.joint_ns[-1]), SPEED_OVER_NS // 2)
+    sampled = np.array([np.interp(times - first, motion.joint_ns - first, q) for q in motion.positions.T]).T
+    moves = sampled[2:] - sampled[:-2]
+    lengths = np.linalg.norm(moves, axis=1)
+    directions = moves / np.maximum(lengths, 1e-300)[:, None]
+    fast = lengths > AT_REST * SPEED_OVER_NS * 1e-9
+    straight = np.zeros(len(times), dtype=np.bool_)
+    straight[2:-2] = fast[2:] & fast[:-2] & ((directions[2:] * directions[:-2]).sum(axis=1) > STRAIGHT)
+    edges = np.flatnonzero(np.diff(straight.astype(np.int8), prepend=0, append=0))
+    found = []
+    for begin, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if times[end - 1] - times[begin] < SHORTEST_NS:
+            continue
+        line = np.abs(sampled[end - 1] - sampled[begin])
+        alone = line.max() > ALONE * np.linalg.norm(line)
+        # What it is compared over ends it two intervals too early; an overlap belongs to the later one.
+        begin_ns, end_ns = int(times[begin]) - 2 * SPEED_OVER_NS, int(times[end - 1]) + 2 * SPEED_OVER_NS
+        found.append(StraightMotion(begin_ns, end_ns, int(line.argmax()) if alone else -1))
     return found
 
 

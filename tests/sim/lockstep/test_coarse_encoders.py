@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.messages.cell_file import CellFile, check_cell
 from stereoservo.messages.goals import Calibrate, JointTarget
@@ -95,5 +96,8 @@ def test_trial_motions_are_done(operated: tuple[LockstepOperator, TrueJointHisto
     assert cell.submit(Calibrate("0000cafe")).accepted
     end = cell.wait_for(lambda event: event.kind in ("calibration_finished", "calibration_aborted"), 600.0, since)
     assert end.kind == "calibration_finished", end.message
-    stops = [event for event in cell.events if event.kind == "calibration_sample"]
-    assert len(stops) == 1 + 4 * 6 + 16
+    collector = TrialCollector(cell.settings)
+    for event in cell.events:
+        collector.add(event)
+    assert {event.trial for event in cell.events if event.kind == "calibration_frames"} == {-1, 0, 1, 2, 3, 4, 5}
+    assert np.bincount(collector.trials().trials + 1, minlength=7).min() >= 10

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import TrialData, load_trials
 from stereoservo.cli.calibrate.stored_trials import RecordedTrialCollector
 from stereoservo.cli.main import invoke
@@ -18,6 +19,7 @@ from stereoservo.core.cycle import StepInputs, StepOutputs
 from stereoservo.daemon.jobs.recorded_set_points import SetPointError, set_points_from_images
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.daemon.lockstep import LockstepCell
+from stereoservo.kinematics.covariance import pixel_covariances, predicted_pixels
 from stereoservo.messages.cell_file import CellFile, check_cell, load_cell_file
 from stereoservo.messages.goals import Calibrate
 from stereoservo.ports.devices import CameraDriver, CameraObservation, Frame
@@ -68,8 +70,7 @@ def pictured_cell(path: Path, stops: int) -> Path:
     for old, new in (
         ('name = "demo"', 'name = "replayed"'),
         ('background = "pybullet"', 'background = "plain"'),
-        ('motion = "sweeps"', 'motion = "stops"'),
-        ("stops = 9", f"stops = {stops}"),
+        ("stops = 9", f'motion = "stops"\nstops = {stops}'),
         ("frames = 4", "frames = 2"),
         ("rate_hz = 250.0", "rate_hz = 100.0"),
         ('driver = "pybullet"            # rigid', 'driver = "fake"  # rigid'),
@@ -165,6 +166,23 @@ def test_a_spread_joint_is_no_second_joint(tmp_path: Path) -> None:
     flown = fly(tmp_path, fake_cell(spread=spread, stops=4))
     events = found_again(flown, flown.observations).events()
     assert [event.trial for event in events] == flown.trials.trials.tolist()
+
+
+def test_sweeps_are_found_from_the_joints_alone(tmp_path: Path) -> None:
+    """The same joints sweep, on as many positions but for a few at the ends; and the model is as good."""
+    flown = fly(tmp_path, fake_cell(motion="sweeps"))
+    job = TrialCollector(read_motion(flown.recording).settings)
+    for event in found_again(flown, flown.observations).events():
+        job.add(event)
+    trials = job.trials()
+    joints, live = (np.bincount(of.trials + 1, minlength=7) for of in (trials, flown.trials))
+    assert (joints[1:] >= 0.6 * live[1:]).all(), (joints, live)
+    models = [fit_model(of, epoch=1).model for of in (trials, flown.trials)]
+    q = flown.trials.positions.mean(axis=0) + np.random.default_rng(3).uniform(-0.1, 0.1, (20, 6))
+    pixels = [predicted_pixels(model, q) for model in models]
+    covariance = sum(pixel_covariances(model, q)[1] for model in models)
+    sigmas = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    assert np.abs((pixels[0] - pixels[1]) / sigmas).max() < 5.0
 
 
 def test_joints_moved_by_hand_are_no_rest(flown: Flown) -> None:

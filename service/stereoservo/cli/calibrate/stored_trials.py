@@ -19,11 +19,12 @@ import numpy as np
 from stereoservo.calibration.single_joint_fit import MIN_STOPS
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, report_folder
 from stereoservo.cli.output import CommandError, log
-from stereoservo.core.cycle import Event
+from stereoservo.core.cycle import Event, PathFrame, PathRecord
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
 from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
 from stereoservo.core.sources.measure_at_pose import too_few_seen
+from stereoservo.core.sources.sweeps import path_frame
 from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import calibration_result
@@ -35,7 +36,14 @@ from stereoservo.messages.recording_request import IMAGES_SUFFIX
 from stereoservo.messages.wire import CalibrationResult
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation, JointDriverDescription, JointSpec
-from stereoservo.recording.recorded_motion import RecordedMotion, RestInterval, read_motion, rest_intervals
+from stereoservo.recording.recorded_motion import (
+    RecordedMotion,
+    RestInterval,
+    StraightMotion,
+    read_motion,
+    rest_intervals,
+    straight_motions,
+)
 
 
 class LinesUsed(msgspec.Struct, frozen=True):
@@ -341,17 +349,18 @@ def trials_from_images(cell_path: Path, images: Path, note: Note, progress: Prog
         gathered.add(_observations(camera, gathered, log, progress))
     job = TrialCollector(settings)
     events = gathered.events()
-    if len(events) < MIN_STOPS:
+    stops = sum(event.kind == "calibration_sample" for event in events)
+    if stops == len(events) and stops < MIN_STOPS:
         raise CalibrationError(
             "too_few_stops",
-            f"the recording shows the arm at rest {len(events)} times with markers in view; at least {MIN_STOPS} "
-            'stops a joint are needed: record a calibration with [calibration] motion = "stops"',
-            stops=len(events),
+            f"the recording shows the arm at rest {stops} times with markers in view, and no straight motion; at least "
+            f"{MIN_STOPS} stops a joint are needed, or sweeps: record a calibration",
+            stops=stops,
         )
     for event in events:
         job.add(event)
     trials = job.trials()
-    return RecordedTrials(trials, len(events), trials.images, gathered.left_out, job.standing)
+    return RecordedTrials(trials, stops, trials.images, gathered.left_out, job.standing)
 
 
 def _observations(
@@ -430,8 +439,17 @@ class _Stop:
 
 
 @dataclass
+class _Sweep:
+    """A straight motion whose frames are being collected."""
+
+    motion: StraightMotion
+    frames: list[PathFrame] = field(default_factory=list)
+
+
+@dataclass
 class RecordedTrialCollector:
-    """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions.
+    """Collects the observations of all cameras, in any order of cameras, into the stops of the trial motions, or, where
+    the arm hardly rests, into their sweeps.
 
     ``settings``: those of the flight, with the cameras and markers of the detectors used now. ``left_out``: number of
     rests that were not used, by reason.
@@ -449,6 +467,9 @@ class RecordedTrialCollector:
             for rest in rest_intervals(self.motion, self.trial.settle_s)
         ]
         self._settled = [stop.rest.settled_ns for stop in self._stops]
+        sweeps = straight_motions(self.motion) if len(self._stops) < MIN_STOPS else []
+        self._sweeps = [_Sweep(motion) for motion in sweeps]
+        self._begins = [motion.begin_ns for motion in sweeps]
         self.used = 0
 
     def wants(self, camera: str, t_ns: int) -> bool:
@@ -456,15 +477,29 @@ class RecordedTrialCollector:
         too.
         """
         column = next(k for k, one in enumerate(self.settings.cameras) if one.name == camera)
+        if self._sweep_at(t_ns) is not None or self._sweep_at(t_ns + BEFORE_NS) is not None:
+            return True
         newest = bisect_right(self._settled, t_ns + BEFORE_NS) - 1
         return any(
             t_ns <= stop.rest.end_ns and stop.sums.frames[column] < self.trial.frames
             for stop in self._stops[max(newest - 1, 0) : newest + 1]
         )
 
+    def _sweep_at(self, t_ns: int) -> _Sweep | None:
+        """The sweep in which a frame of this time was taken."""
+        number = bisect_right(self._begins, t_ns) - 1
+        inside = number >= 0 and t_ns <= self._sweeps[number].motion.end_ns
+        return self._sweeps[number] if inside else None
+
     def add(self, observations: Iterable[CameraObservation]) -> None:
-        """Add one camera's observations in order of time; those made in motion are skipped."""
+        """Add one camera's observations in order of time; those that belong to no stop or sweep are skipped."""
+        columns = {camera.name: k for k, camera in enumerate(self.settings.cameras)}
         for observation in observations:
+            sweep = self._sweep_at(observation.t_shutter_ns)
+            if sweep is not None:
+                sweep.frames.append(path_frame(columns[observation.camera], observation))
+                self.used += 1
+                continue
             number = bisect_right(self._settled, observation.t_shutter_ns - 1) - 1
             if number < 0:
                 continue
@@ -510,6 +545,12 @@ class RecordedTrialCollector:
                 samples = averages(stop.sums, self.settings)
                 event = Event(len(events) + 1, stop.rest.end_ns, "calibration_sample", id="images", joints=joints)
                 events.append(msgspec.structs.replace(event, samples=samples, trial=trial))
+        for leg, sweep in enumerate(self._sweeps):
+            motion, ends_ns = sweep.motion, [*self._begins, np.iinfo(np.int64).max][leg + 1]
+            event = Event(len(events) + 1, motion.end_ns, "calibration_frames", id="images", trial=motion.joint)
+            inside = (self.motion.joint_ns >= motion.begin_ns) & (self.motion.joint_ns < min(motion.end_ns, ends_ns))
+            path = PathRecord(tuple(sweep.frames), self.motion.joint_ns[inside], self.motion.positions[inside], leg)
+            events.append(msgspec.structs.replace(event, path=path))
         return events
 
     def _good(self, stop: _Stop) -> bool:

@@ -4,12 +4,16 @@ From the base each joint sweeps outwards alone and back, then all joints sweep a
 An outward sweep ends at its planned offset, or where the markers are about to leave a view; the joint then sweeps to
 the other side as well. Frames and joint samples are recorded as they come and sent in events `calibration_frames`;
 `calibration.sweeps` reduces them to means. Only at the base the arm rests, to see that the markers are in view.
+
+Frames of a moving arm are worth as much as their stamps: where errors of single stamps displace the markers as much as
+noise does, the programme with stops begins instead.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from stereoservo.calibration.sweeps import smoothed_readings, stamp_scatter
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import PathFrame
 from stereoservo.core.rest_averages import marker_rows
@@ -23,6 +27,7 @@ from stereoservo.core.sources.calibration import (
     marker_pixels,
     record_joints,
     room,
+    start_trials,
     taken_path,
     too_little,
 )
@@ -45,7 +50,8 @@ from stereoservo.core.sources.measure_at_pose import (
 )
 from stereoservo.core.state import SweepMotion
 from stereoservo.messages.reasons import Reason
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.numerics.arrays import BoolArray, FloatArray
+from stereoservo.ports.devices import CameraObservation
 
 ALONE, ENOUGH_SIGMAS = 0.5, 200.0
 """Offset, as a fraction of its range, and motion in the images [sigmas] with which a joint's sweep alone ends."""
@@ -63,6 +69,12 @@ PASSED = 0.05
 """Fraction of a sweep's length from its end at which the next one begins."""
 LATE_S = 0.3
 """How long frames are awaited at the end of the last sweep."""
+MOST_SCATTER = 0.25
+"""Mean square displacement of all markers of a frame by errors of its stamp, as a fraction of the variance of a pixel
+coordinate, above which the arm stops for its measurements: half a sigma.
+"""
+FEWEST_FRAMES_JUDGED, CLEARLY = 20, 8.0
+"""Number of frames of a camera from which it is judged, and the standard deviations by which it then exceeds that."""
 CHUNK = 2000
 """Number of marker observations from which an event is sent before its sweep ends."""
 
@@ -77,7 +89,7 @@ def start_sweeps(goal_id: str, q: FloatArray, now_ns: int, settings: CoreSetting
         base_pixels=unseen, last=unseen.copy(), last_ns=np.zeros(len(settings.cameras), np.int64),
         rates=np.zeros_like(unseen), lowest=trials.base.copy(), highest=trials.base.copy(),
         motion_sigmas=np.zeros(n), sigma_px=0.0, slope_sums=np.zeros((n, *unseen.shape)),
-        slope_weights=np.zeros((n, *unseen.shape[:2])),
+        slope_weights=np.zeros((n, *unseen.shape[:2])), stamp_sums=np.zeros((len(settings.cameras), 2)),
         **first_visit(trials.base, q, now_ns, settings),  # type: ignore[arg-type]
     )  # fmt: skip
 
@@ -161,18 +173,23 @@ def _end(sweeps: SweepMotion, context: StepContext) -> SourceOutput:
 def _record(sweeps: SweepMotion, context: StepContext) -> None:
     """Record the frames and joint samples of this step, and how the markers move."""
     for camera, observation in context.ingested.observations:
-        frame = PathFrame(
-            camera,
-            observation.t_shutter_ns,
-            np.array(observation.ids, dtype=np.int64),
-            np.array(observation.pixels),
-            0.5 * np.trace(observation.covariances, axis1=1, axis2=2),
-        )
+        frame = path_frame(camera, observation)
         sweeps.path_frames.append(frame)
         _track(sweeps, context, frame)
     record_joints(sweeps, context)
     if context.ingested.observations and sum(frame.ids.size for frame in sweeps.path_frames) >= CHUNK:
         _send(sweeps, context)
+
+
+def path_frame(camera: int, observation: CameraObservation) -> PathFrame:
+    """A frame of a sweep, with a copy of its pixels."""
+    return PathFrame(
+        camera,
+        observation.t_shutter_ns,
+        np.array(observation.ids, dtype=np.int64),
+        np.array(observation.pixels),
+        0.5 * np.trace(observation.covariances, axis1=1, axis2=2),
+    )
 
 
 def _track(sweeps: SweepMotion, context: StepContext, frame: PathFrame) -> None:
@@ -211,6 +228,46 @@ def _send(sweeps: SweepMotion, context: StepContext) -> None:
             progress=min(1.0, done),
             path=taken_path(sweeps, sweeps.leg),
         )
+
+
+def _judge_stamps(sweeps: SweepMotion, context: StepContext) -> None:
+    """Add the scatter of the cameras' stamps on this sweep to its sums."""
+    start_ns, joint = sweeps.path_ns[0], sweeps.joint
+    times, readings = 1e-9 * (np.array(sweeps.path_ns) - start_ns), np.array(sweeps.path_joints)[:, [joint]]
+    resolution = np.array([context.settings.resolution[joint] if context.settings.resolution else 0.0])
+    times, readings = smoothed_readings(times, readings, resolution)
+    for camera in range(len(sweeps.stamp_sums)):
+        frames = sorted((f for f in sweeps.path_frames if f.camera == camera), key=lambda frame: frame.t_ns)
+        pixels = np.full((len(frames), *sweeps.last.shape[1:]), np.nan)
+        for k, frame in enumerate(frames):
+            rows = marker_rows(context.settings, frame.ids)
+            pixels[k, rows[rows >= 0]] = frame.pixels[rows >= 0]
+        stamps = np.array([1e-9 * (frame.t_ns - start_ns) for frame in frames])
+        scatter, count = stamp_scatter(stamps, pixels, times, readings[:, 0], float(resolution[0]))
+        sweeps.stamp_sums[camera] += count * scatter, count
+
+
+def _scattered(sums: FloatArray, markers: int) -> BoolArray:
+    """Mask (c,) of the cameras whose stamps scatter by more than sweeps permit, from their ``sums`` (c, 2)."""
+    scatter, counts = sums[:, 0] / np.maximum(sums[:, 1], 1.0), sums[:, 1]
+    # The excess of a chi-square's median over n frames deviates by 1.66 √(2 / n); markers share one displacement.
+    limit = MOST_SCATTER + CLEARLY * 1.66 * np.sqrt(2.0 / np.maximum(counts, 1.0)) / markers
+    return np.asarray((counts >= FEWEST_FRAMES_JUDGED) & (scatter > limit))
+
+
+def _stop_instead(sweeps: SweepMotion, context: StepContext, camera: int) -> SourceOutput:
+    """Begin the programme with stops."""
+    scatter = float(np.sqrt(sweeps.stamp_sums[camera, 0] / sweeps.stamp_sums[camera, 1]))
+    name = context.settings.cameras[camera].name
+    message = (
+        f"calibration: in motion the stamps of camera {name} displace the markers of a frame by {scatter:.1f} times "
+        f"the noise of a pixel (limit {np.sqrt(MOST_SCATTER):.1f}); the arm stops for measurements instead"
+    )
+    context.emit("warning", id=sweeps.id, message=message)
+    trials = start_trials(sweeps.id, context.q, context.now_ns, context.settings)
+    trials.lease_s, trials.lease_until_ns = sweeps.lease_s, sweeps.lease_until_ns
+    context.state.source = trials
+    return rest(context)
 
 
 # -- where the joints sweep -----------------------------------------------------------------------------------
@@ -265,6 +322,10 @@ def _range(joint: int, context: StepContext, settings: TrialSettings) -> float:
 def _next(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> SourceOutput:
     """Start the next sweep: back to the base, to the joint's other side, of the next joint, of all joints, or home."""
     n = sweeps.lowest.size
+    if sweeps.leg >= 0 and sweeps.joint < n:
+        _judge_stamps(sweeps, context)
+        for camera in np.flatnonzero(_scattered(sweeps.stamp_sums, len(context.settings.marker_ids))):
+            return _stop_instead(sweeps, context, int(camera))
     if sweeps.outward and sweeps.joint < n:
         return _begin(sweeps, context, settings.base.copy(), outward=False)
     while sweeps.joint < n:

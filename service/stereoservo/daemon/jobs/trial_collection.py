@@ -6,7 +6,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.calibration.sweeps import LONGEST_DELAY_S, Leg, LegMeans, leg_means, links_displaced, sweep_timing
+from stereoservo.calibration.sweeps import (
+    LONGEST_DELAY_S,
+    Leg,
+    LegMeans,
+    leg_means,
+    links_displaced,
+    smoothed_readings,
+    sweep_timing,
+)
 from stereoservo.calibration.trial_data import (
     CalibrationError,
     TrialCamera,
@@ -65,7 +73,11 @@ class TrialCollector:
             self._stops.clear()
             self._sweeps.clear()
             self._loads = None
-        (self._stops if event.kind == "calibration_sample" else self._sweeps).append(event)
+        if event.kind == "calibration_frames":
+            self._sweeps.append(event)
+            return
+        self._sweeps.clear()  # stops after sweeps: their stamps are not exact enough
+        self._stops.append(event)
 
     def trials(self) -> TrialData:
         """All stops as trial data, without markers that no camera ever saw or that are static (``standing``).
@@ -174,6 +186,7 @@ class TrialCollector:
         order = sorted(starts)
         frames = sorted((frame for _, record in records for frame in record.frames), key=lambda frame: frame.t_ns)
         resolution = np.array(self._settings.resolution or (0.0,) * positions.shape[1])
+        times, positions = smoothed_readings(times, positions, resolution)
         legs = []
         for leg, following in zip(order, [*order[1:], None], strict=True):
             begin, end = starts[leg], float(times[-1]) if following is None else starts[following]
@@ -193,6 +206,7 @@ class TrialCollector:
                     tuple(pixels for _, pixels, _ in observed),
                     tuple(variances for _, _, variances in observed),
                     resolution,
+                    tuple(camera.height for camera in self._settings.cameras),
                 )
             )
         return legs
@@ -245,7 +259,7 @@ def _means_of_legs(legs: list[Leg], settings: CoreSettings) -> list[tuple[Leg, L
     timing = sweep_timing(legs, len(settings.cameras))
     found = []
     for leg, displaced in zip(legs, links_displaced(legs, timing.play), strict=True):
-        means = leg_means(leg, timing.delays, settings.trials.frames)
+        means = leg_means(leg, timing, settings.trials.frames)
         if means is not None:
             found.append((leg, means._replace(positions=means.positions + displaced)))
     return found
