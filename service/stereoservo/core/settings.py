@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.messages.cell_file import (
+    MAX_JOINTS,
     MAX_MARKERS,
     CellFile,
     CellFileError,
@@ -180,13 +181,10 @@ def _arrival(resolution: tuple[float, ...], joints: int) -> FloatArray:
 MIN_MARKERS = 3
 """Number of markers that determine the pose of a free body."""
 RIGID_FREEDOMS = 6
-
-
-def fewest_markers(joints: int) -> int:
-    """Least number of markers that a goal has to show. For an arm of fewer than six joints fewer are sufficient,
-    because the goal must be reachable.
-    """
-    return MIN_MARKERS if joints >= RIGID_FREEDOMS else 1
+FEWEST_MARKERS = (1,) * RIGID_FREEDOMS + (MIN_MARKERS,) * (MAX_JOINTS + 1 - RIGID_FREEDOMS)
+"""Least number of markers that a goal has to show, by the number of joints. For an arm of fewer than six joints fewer are
+sufficient, because the goal must be reachable.
+"""
 
 
 def core_settings(

@@ -36,7 +36,7 @@ from stereoservo.core.goals.marker_body import (
 )
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
-from stereoservo.core.settings import MIN_MARKERS, CameraSettings, CoreSettings, fewest_markers
+from stereoservo.core.settings import FEWEST_MARKERS, MIN_MARKERS, CameraSettings, CoreSettings
 from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
     invert4,
@@ -117,7 +117,7 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
     arrays = place.arrays
     aim.targets, aim.known = _intersected(arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity)
     shown = int((aim.wanted.sum(axis=0) > 0).sum())
-    needed = fewest_markers(len(place.operators))
+    needed = FEWEST_MARKERS[len(place.operators)]
     if shown < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
@@ -247,7 +247,7 @@ def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
 
 def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
     arrays = place.arrays
-    needed = fewest_markers(len(place.operators))
+    needed = FEWEST_MARKERS[len(place.operators)]
     if len(target.points) < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
