@@ -182,8 +182,8 @@ MIN_MARKERS = 3
 """Number of markers that determine the pose of a free body."""
 RIGID_FREEDOMS = 6
 FEWEST_MARKERS = (1,) * RIGID_FREEDOMS + (MIN_MARKERS,) * (MAX_JOINTS + 1 - RIGID_FREEDOMS)
-"""Least number of markers that a goal has to show, by the number of joints. For an arm of fewer than six joints fewer are
-sufficient, because the goal must be reachable.
+"""Least number of markers that a goal has to show, by the number of joints. For an arm of fewer than six joints fewer
+are sufficient, because the goal must be reachable.
 """
 
 
