@@ -120,6 +120,8 @@ def test_files_that_are_none_are_named(run: Run, tmp_path: Path) -> None:
     assert run("bench", "--check", "--trials", "x.npz")[1]["error"]["code"] == "argument"
     assert run("bench", "--reset-zeros")[1]["error"]["code"] == "argument"
     assert run("bench", "--unattended")[1]["error"]["code"] == "argument"
+    assert run("bench", "--quick")[1]["error"]["code"] == "argument"
+    assert run("bench", "--check", "--quick", "--reset-zeros")[1]["error"]["code"] == "argument"
 
 
 def straight_lines(cell: SyntheticCell, camera: int) -> str:

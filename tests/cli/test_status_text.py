@@ -51,6 +51,13 @@ def test_a_state_of_an_older_daemon_is_read() -> None:
     assert decode(msgspec.json.encode(tree), StateMessage) == STATE
 
 
+def test_a_kept_model_that_no_frame_has_confirmed_is_told_in_words() -> None:
+    assert said(model="unconfirmed")[0] == (
+        "demo: active, model unconfirmed (epoch 1: kept, not confirmed by the images yet), hold"
+    )
+    assert "kept" not in said()[0]
+
+
 def test_the_models_health_is_told_camera_by_camera() -> None:
     assert not [line for line in said() if line.startswith("  model ")]
     health = Health(

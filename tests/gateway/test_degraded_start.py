@@ -82,9 +82,11 @@ def flip(path: Path, at: int) -> None:
 class StubLink:
     def __init__(self) -> None:
         self.models: list[int] = []
+        self.kept: list[bool] = []
 
-    def send_model(self, model: Any, reanchored: tuple[str, ...] = ()) -> bool:
+    def send_model(self, model: Any, reanchored: tuple[str, ...] = (), *, kept: bool = False) -> bool:
         self.models.append(model.epoch)
+        self.kept.append(kept)
         return True
 
 
@@ -96,6 +98,7 @@ def test_a_damaged_model_is_set_aside_and_the_one_before_is_used(tmp_path: Path,
     jobs = CalibrationJobs(SETTINGS, store, cast(ServoConnection, link), bench.log, tmp_path / "checks.jsonl")
     jobs.load(0)
     assert link.models == [2]
+    assert link.kept == [True]
     (note,) = jobs.notes
     assert "model-000003.json" in note
     assert "set aside as model-000003.json.damaged-1" in note

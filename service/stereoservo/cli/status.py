@@ -18,6 +18,7 @@ from stereoservo.messages.compilation_progress import read_progress
 from stereoservo.messages.directories import CellDirectories, cell_directories
 from stereoservo.messages.discovery import find_daemon, live_cells
 from stereoservo.messages.servo_state import STATE_LAYOUT, decode_state, read_run, state_message
+from stereoservo.messages.status import ModelReadiness
 from stereoservo.messages.wire import EventMessage, StateMessage
 
 CAUSES = ("held", "stopped", "goal_aborted", "calibration_aborted", "ring_kept")
@@ -89,8 +90,9 @@ def _failure(code: str, words: str, state: StateMessage | None, as_json: bool) -
 
 def describe(state: StateMessage) -> str:
     """A state as some lines of text."""
+    kept = ": kept, not confirmed by the images yet" if state.model == ModelReadiness.UNCONFIRMED else ""
     lines = [
-        f"{state.cell}: {state.lifecycle}, model {state.model} (epoch {state.model_epoch}), {state.source}",
+        f"{state.cell}: {state.lifecycle}, model {state.model} (epoch {state.model_epoch}{kept}), {state.source}",
         f"  joints  {_joints(state)}",
         f"  loop    {state.loop.rate_hz:g} Hz, {state.loop.cycles} cycles, {state.loop.overruns} "
         f"overruns, lateness p99 "

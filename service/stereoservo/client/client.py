@@ -276,9 +276,13 @@ class Client(Connection):
         timeout_s: float = 600.0,
         *,
         lease_s: float | None = 5.0,
+        quick: bool = False,
     ) -> CheckReport:
-        """Run a short check motion and test whether the model is still valid. Raises RefusedError, FailedError."""
-        return check_model(self, progress, timeout_s, lease_s)
+        """Run a short check motion and test whether the model is still valid. Raises RefusedError, FailedError.
+
+        ``quick``: at most three seconds of motion, around the present posture.
+        """
+        return check_model(self, progress, timeout_s, lease_s, quick=quick)
 
     def reset_zeros(
         self,
@@ -369,10 +373,10 @@ def calibrate(
 
 
 def check_model(
-    connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None
+    connection: Connection, progress: Progress | None, timeout_s: float, lease_s: float | None, *, quick: bool
 ) -> CheckReport:
     """Implementation of `Client.check_model`."""
-    command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s)
+    command = Calibrate(str(uuid.uuid4()), check=True, lease_s=lease_s, quick=quick)
     event = _run(connection, command, "checked", progress, timeout_s, False)
     if event.check is None:
         raise FailedError("check", event)

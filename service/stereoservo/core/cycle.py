@@ -33,10 +33,12 @@ class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
     """A new model for the core: taken only at rest, with an epoch.
 
     ``reanchored``: cameras of which only the matrices are new, in the same frame as before: a suspended goal continues.
+    ``kept``: from an earlier run; frames must confirm it before goals use it.
     """
 
     model: CellModel
     reanchored: tuple[str, ...] = ()
+    kept: bool = False
 
 
 class StepInputs(msgspec.Struct, frozen=True, eq=False, omit_defaults=True):
@@ -69,6 +71,7 @@ EventKind = Literal[
     "reply",  # answer to a request: accepted or refused
     "lifecycle",
     "model",
+    "model_compared",  # rounds of frames agree with a kept model (accepted), or contradict it
     "goal_started",
     "goal_face",  # the law uses another face of the body from now on
     "target_seen",  # the target that a goal follows is found, or is visible again

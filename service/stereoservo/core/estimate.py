@@ -19,7 +19,7 @@ from stereoservo.core.context import LENS_SIZE, StepContext, Workspace
 from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.ingest import TAKEN, newest_frames
 from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays, require_fitting
-from stereoservo.core.monitor_state import MOVED
+from stereoservo.core.monitor_state import MOVED, ModelComparison
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
 from stereoservo.core.monitors.diagnosis import start_model_monitor
@@ -46,6 +46,7 @@ from stereoservo.core.state import CoreState, share_sights
 from stereoservo.core.target import track
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import MAX_MARKERS
+from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
@@ -152,6 +153,9 @@ def take_model(context: StepContext) -> None:
     else:
         use_model(state.pending_model, context)
         state.reanchoring = None
+        if state.pending_kept:
+            state.readiness = ModelReadiness.UNCONFIRMED
+            state.comparison = ModelComparison(context.now_ns, NOT_COMPARED)
     arrays, model = context.derived.arrays, state.model
     assert arrays is not None
     assert model is not None
@@ -160,6 +164,14 @@ def take_model(context: StepContext) -> None:
     readiness = str(state.readiness)
     context.emit("model", message=f"model epoch {model.epoch} is {readiness}", name=readiness)
     track.tell_untrackable(context)
+
+
+NOT_COMPARED = Reason(
+    "MODEL_UNCONFIRMED",
+    "hold",
+    hint="the kept model is not confirmed: no camera has delivered a frame since it was loaded. Are the cameras "
+    "connected? See the daemon's log",
+)
 
 
 def _await_model(update: ModelUpdate, context: StepContext) -> None:
@@ -171,7 +183,7 @@ def _await_model(update: ModelUpdate, context: StepContext) -> None:
             context.emit("warning", message=f"re-anchored model refused: {refusal}")
             return
     state.pending_model = moving_camera.with_adjusted(state, update.model, update.reanchored)
-    state.pending_reanchored = update.reanchored
+    state.pending_reanchored, state.pending_kept = update.reanchored, update.kept
 
 
 def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = ()) -> None:
@@ -183,7 +195,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     state.model = model
     loads = context.derived.load_limits = load_limits(settings, model)
     context.derived.room.limit_loads(loads)
-    state.readiness = fitted_readiness(model)
+    state.readiness, state.comparison = fitted_readiness(model), None
     offsets = stated_offsets(model)
     state.cameras = [CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras]
     share_sights(state)

@@ -40,7 +40,12 @@ from stereoservo.core.monitors.diagnosis import (
     mask_marker,
     unmask_returned,
 )
-from stereoservo.core.monitors.fault_isolation import diagnosed_beside_joint_errors, present_problem
+from stereoservo.core.monitors.fault_isolation import (
+    LinearisedProblem,
+    diagnosed_beside_joint_errors,
+    present_problem,
+    without_joint_errors,
+)
 from stereoservo.core.monitors.following import (
     LAG_S,
     SILENCE_S,
@@ -66,7 +71,7 @@ from stereoservo.core.prediction import (
 )
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.teaching import teach_step
-from stereoservo.core.state import CoreState, TrialMotion
+from stereoservo.core.state import CoreState, Holding, TrialMotion
 from stereoservo.core.target.track import beside_target
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle, ModelReadiness
@@ -622,10 +627,10 @@ def _monitor_model(context: StepContext) -> Iterator[Finding]:
         return
     if state.readiness == ModelReadiness.SUSPECT and state.model is not None:
         if min(estimate.agreeing_frames for estimate in state.cameras) >= TRUSTED_FRAMES:
-            state.readiness = fitted_readiness(state.model)
+            state.readiness, state.comparison = fitted_readiness(state.model), None
             context.emit("model", message="the images agree with the model again", name=str(state.readiness))
         return
-    if state.readiness not in (ModelReadiness.VALID, ModelReadiness.CANDIDATE):
+    if state.readiness in (ModelReadiness.NONE, ModelReadiness.SUSPECT):
         return
     for camera, estimate in zip(context.settings.cameras, state.cameras, strict=True):
         if estimate.rejected_frames < SUSPECT_FRAMES:
@@ -639,12 +644,78 @@ def _monitor_model(context: StepContext) -> Iterator[Finding]:
             float(SUSPECT_FRAMES),
             "frames",
             state.watching.verdict.text
-            or f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Calibrate again",
+            or f"camera {camera.name} contradicts the model: was it moved, has a marker slipped? Run calibrate --check "
+            "--quick, or calibrate again",
         )
         context.emit("model", message=reason.hint, name=str(state.readiness), reasons=(reason,))
         if MOTION_SOURCES[type(state.source)].runs_law:
             yield Finding("abort", reason, reason.hint)
         return
+
+
+COMPARED_ROUNDS = 5
+"""Number of consecutive rounds of frames at rest that confirm a kept model, or after which it is reported as wrong."""
+FEWEST_COMPARED = 3
+"""Number of markers and static points that each camera must show for the comparison."""
+SILENT_S = 3.0
+"""Time [s] after which a camera that delivers no frames is left out of the comparison."""
+
+
+NOT_AT_REST = Reason("MODEL_UNCONFIRMED", "hold", hint="the kept model is compared while the arm rests without a goal")
+
+
+def _compare_kept_model(context: StepContext) -> Findings:
+    """Compare a kept model with the images at rest, by the test of the model monitor; the model is used once
+    `COMPARED_ROUNDS` rounds in succession agree.
+    """
+    state, looked_at = context.state, context.derived.room.numbers.looked_at
+    comparison, arrays = state.comparison, context.arrays
+    if comparison is None or state.readiness is not ModelReadiness.UNCONFIRMED or not looked_at or arrays is None:
+        return ()
+    if state.reanchoring is not None or not isinstance(state.source, Holding) or bool(state.block.command.any()):
+        comparison.rounds, comparison.reason = 0, NOT_AT_REST
+        return ()
+    problem = present_problem(state, _cameras(looked_at), arrays, context.settings)
+    lacking = _lacking(problem, comparison.since_ns, context)
+    if lacking is not None:
+        comparison.rounds, comparison.reason = 0, lacking
+        return ()
+    fitted = without_joint_errors(problem, problem.weights)
+    cleared = problem if fitted is None else problem.with_innovation(fitted[0])
+    value, limit, row = cleared.worst_test(problem.weights)
+    verdict, camera = state.watching.last[-1], context.settings.cameras[problem.known[row]].name
+    agrees = verdict.kind == "ok" or 0.0 < verdict.moved_px <= context.settings.tolerance_px
+    comparison.rounds = max(comparison.rounds, 0) + 1 if agrees else min(comparison.rounds, 0) - 1
+    confirmed = comparison.rounds >= COMPARED_ROUNDS
+    found = f"camera {camera} {'agrees' if agrees else 'disagrees'}: chi-square {value:.4g}, limit {limit:.4g}"
+    hint = f"the kept model is {'' if confirmed else 'not '}confirmed: {'; '.join(filter(None, (found, verdict.text)))}"
+    hint += "" if agrees else ". Run calibrate --check --quick, or calibrate"
+    comparison.reason = Reason("MODEL_UNCONFIRMED", "hold", camera, value, limit, "chi-square", hint)
+    if confirmed and state.model is not None:
+        state.readiness, state.comparison = fitted_readiness(state.model), None
+    if abs(comparison.rounds) == COMPARED_ROUNDS:
+        result = Reason("MODEL_COMPARED", "info", camera, value, limit, "chi-square", hint)
+        context.emit("model_compared", accepted=confirmed, message=hint, reasons=(result,), name=str(state.readiness))
+    return ()
+
+
+def _lacking(problem: LinearisedProblem, since_ns: int, context: StepContext) -> Reason | None:
+    """What a round lacks for the comparison with a kept model, loaded at ``since_ns``: frames or markers of a camera.
+    Cameras that move are left out.
+    """
+    seen = dict(zip(problem.known, (problem.weights > 0.0).sum(axis=1).tolist(), strict=True))
+    least = min(FEWEST_COMPARED, problem.weights.shape[1])
+    waits = (context.now_ns - since_ns) * 1e-9 <= SILENT_S
+    for c, (camera, mobile) in enumerate(zip(context.settings.cameras, context.state.mobile, strict=True)):
+        count = seen.get(c, 0 if waits else least)
+        if count >= least or (mobile is not None and mobile.moving):
+            continue
+        shows = "delivers no frames: is it connected? See the daemon's log"
+        if c in seen:
+            shows = f"shows {count} of its markers, {least} are needed: jog the arm into view, or run calibrate --check"
+        hint = f"the kept model is not confirmed: camera {camera.name} {shows}"
+        return Reason("MODEL_UNCONFIRMED", "hold", camera.name, float(count), float(least), "markers", hint)
+    return None
 
 
 def _monitor_relocalization(context: StepContext) -> Findings:
@@ -683,6 +754,7 @@ MONITORS: tuple[Monitor, ...] = (
         _monitor_innovations,
         lambda state: state.watching.verdict.kind != "ok" or looks_apart(state),
     ),
+    Monitor("comparison", _compare_kept_model, lambda state: state.readiness is ModelReadiness.UNCONFIRMED),
     Monitor("model", _monitor_model, lambda state: state.readiness is ModelReadiness.SUSPECT),
     Monitor("relocalization", _monitor_relocalization, lambda state: state.reanchoring is not None),
 )

@@ -63,6 +63,20 @@ class ModelMonitor(msgspec.Struct, eq=False):
     last: list[ModelDiagnosis] = []
 
 
+class ModelComparison(msgspec.Struct, eq=False):
+    """Comparison of a kept model with the images, since the model was loaded at ``since_ns``.
+
+    ``rounds``: number of the last rounds of frames that agree with it, negative if they contradict it.
+    ``reason``: why it is not confirmed.
+    ``wait_until_ns``: until when goals wait for it to be confirmed; 0: none waits.
+    """
+
+    since_ns: int
+    reason: Reason
+    rounds: int = 0
+    wait_until_ns: int = 0
+
+
 class MobileCamera(msgspec.Struct, eq=False):
     """A camera declared mobile; see `moving_camera`. While it is ``moving``, the model keeps its last static matrix.
 

@@ -129,6 +129,8 @@ def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
         found.append(Reason("HELD", "hold", hint="resume to go on"))
     if state.readiness == ModelReadiness.SUSPECT:
         found.append(Reason("MODEL_SUSPECT", "hold", hint="calibrate again"))
+    if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
+        found.append(state.comparison.reason)
     return tuple(found)
 
 

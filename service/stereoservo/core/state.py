@@ -15,6 +15,7 @@ from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.cycle import PathFrame
 from stereoservo.core.monitor_state import (
     MobileCamera,
+    ModelComparison,
     ModelMonitor,
     ObservationStatistics,
     Relocalization,
@@ -322,6 +323,7 @@ class CheckMotion(PoseMeasurement, tag="checking", eq=False, kw_only=True):
     seen: int = 0
     """Number of stops at which every camera saw enough."""
     reset_zeros: bool = False
+    quick: bool = False
 
 
 class TeachingState(ObservationStatistics, eq=False):
@@ -442,6 +444,10 @@ class CoreState(msgspec.Struct, eq=False):
     """The goal for which friction is compensated; empty: none."""
     target: TargetBody | None = None
     """The target body that moves on its own and is followed; None before a goal has named it."""
+    pending_kept: bool = False
+    """Of ``pending_model``: see `cycle.ModelUpdate`."""
+    comparison: ModelComparison | None = None
+    """Of a kept model with the images; None once they have confirmed it, and for a model of this run."""
 
     @property
     def history(self) -> JointHistory:

@@ -112,10 +112,11 @@ class Ask(msgspec.Struct, frozen=True, tag="ask"):
 
 
 class NewModel(msgspec.Struct, frozen=True, tag="model", eq=False):
-    """A model for the core. ``reanchored``: see `cycle.ModelUpdate`."""
+    """A model for the core. ``reanchored``, ``kept``: see `cycle.ModelUpdate`."""
 
     model: CellModel
     reanchored: tuple[str, ...] = ()
+    kept: bool = False
 
 
 ToServo = Received | Heartbeat | Ask | NewModel

@@ -83,7 +83,7 @@ class ProcessLinks:
             self._waiting.register(peer.fileno(), select.EPOLLIN)
             messages += self._messages_of(peer)
             connected = True
-        models = [ModelUpdate(m.model, m.reanchored) for m in messages if isinstance(m, NewModel)]
+        models = [ModelUpdate(m.model, m.reanchored, m.kept) for m in messages if isinstance(m, NewModel)]
         return GatewayMessages(
             connected or bool(messages),
             tuple(message.request for message in messages if isinstance(message, Ask)),

@@ -67,7 +67,7 @@ class CalibrationJobs:
         for text in self.notes:
             self._log.add("warning", message=text, origin="gateway")
         # Not sent again, after a restart of the gateway, to a core that has it: that would reset the core's estimates.
-        if model is not None and (model.epoch == core_epoch or self._link.send_model(model)):
+        if model is not None and (model.epoch == core_epoch or self._link.send_model(model, kept=True)):
             self.model = model
 
     def on_core_event(self, event: Event, *, fresh: bool) -> None:

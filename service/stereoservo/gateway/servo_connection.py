@@ -95,8 +95,9 @@ class ServoConnection:
             return None
         return number
 
-    def send_model(self, model: CellModel, reanchored: tuple[str, ...] = ()) -> bool:
+    def send_model(self, model: CellModel, reanchored: tuple[str, ...] = (), *, kept: bool = False) -> bool:
         """Send a model to the core, with the coplanar groups of its markers, which the loop has no time to compute.
+        ``reanchored``, ``kept``: see `cycle.ModelUpdate`.
 
         The covariance, which the loop does not use, is omitted: messages have a maximum size.
         """
@@ -105,7 +106,7 @@ class ServoConnection:
             from stereoservo.control.marker_groups import with_groups
 
             bare = with_groups(bare)
-        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored)))
+        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored, kept)))
 
     def events(self) -> list[Event]:
         """Core events since the last call, in order."""

@@ -347,7 +347,8 @@ class Home(msgspec.Struct, frozen=True, tag="home", tag_field="command", forbid_
 class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="command", forbid_unknown_fields=True):
     """Run the trial motions of the cell file and fit a model.
 
-    ``check``: run the short check motion instead, and report whether the model is still valid.
+    ``check``: run the short check motion instead, and report whether the model is still valid; with ``quick``, one of
+    at most three seconds of motion around the present posture.
     ``lease_s``: the motion ends if no renewal arrives for so long (None: no lease); the subsequent fit needs no client.
     ``reset_zeros``, with ``check``: if the zeros of joints have drifted, and nothing else has changed, make a model
     with corrected zeros.
@@ -357,6 +358,7 @@ class Calibrate(msgspec.Struct, frozen=True, tag="calibrate", tag_field="command
     check: bool = False
     lease_s: Lease | None = None
     reset_zeros: bool = False
+    quick: bool = False
 
 
 class Teach(msgspec.Struct, frozen=True, tag="teach", tag_field="command", forbid_unknown_fields=True):

@@ -25,9 +25,10 @@ class Lifecycle(StrEnum):
 
 
 class ModelReadiness(StrEnum):
-    """State of the model of arm and cameras."""
+    """State of the model of arm and cameras. UNCONFIRMED: kept from an earlier run; no frames have confirmed it yet."""
 
     NONE = "none"
+    UNCONFIRMED = "unconfirmed"
     CANDIDATE = "candidate"
     VALID = "valid"
     SUSPECT = "suspect"

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -52,6 +53,9 @@ class CalibrateOptions:
     check: Annotated[bool, typer.Option("--check", help="A short check motion: does the model in use still hold?")] = (
         False
     )
+    quick: Annotated[
+        bool, typer.Option("--quick", help="With --check: at most 3 s of motion, around the present posture.")
+    ] = False
     reset_zeros: Annotated[
         bool,
         typer.Option(
@@ -161,8 +165,10 @@ def calibrate(given: CalibrateOptions = CALIBRATE_OPTIONS, options: CellOptions 
             reply = client.undo_refinement()
         options.emit(msgspec.to_builtins(reply), reply.message)
         return
-    if (given.reset_zeros or given.unattended) and not given.check:
-        raise CommandError("argument", "--reset-zeros and --unattended go with --check")
+    if (given.reset_zeros or given.unattended or given.quick) and not given.check:
+        raise CommandError("argument", "--reset-zeros, --unattended and --quick go with --check")
+    if given.reset_zeros and given.quick:
+        raise CommandError("argument", "zeros are reset by the whole check: --reset-zeros goes without --quick")
     if (trials is not None or images is not None) and given.check:
         raise CommandError("argument", "--check moves the arm, --trials and --images do not: give one of them")
     if trials is not None and images is not None:
@@ -207,7 +213,7 @@ def _calibrate_live(given: CalibrateOptions, options: CellOptions) -> None:
                 _reset_zeros(client, options.json)
                 return
             if given.check:
-                report = _with_bar(client, "check motion", client.check_model)
+                report = _with_bar(client, "check motion", partial(client.check_model, quick=given.quick))
                 _print_check(report, client.cell, options.endpoint, options.json)
                 if given.unattended and report.status == "recalibrate":
                     raise typer.Exit(EXIT_FAILED)

@@ -57,6 +57,7 @@ from stereoservo.messages.goals import (
     Hold,
     Home,
     Jog,
+    JointTarget,
     OrderAuxiliary,
     PlanReport,
     ReanchorRefused,
@@ -69,7 +70,7 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.status import Lifecycle
+from stereoservo.messages.status import Lifecycle, ModelReadiness
 
 QUEUE_LENGTH = 16
 
@@ -355,29 +356,51 @@ def answer(request: Request, context: StepContext) -> None:
         _answer(request, context)
         return
     waiting = context.state.waiting
-    if not waiting and _free(context):
+    if not waiting and _free(request, context):
         _answer(request, context)
     elif len(waiting) < QUEUE_LENGTH:
         waiting.append(request)
     else:
-        hint = f"{QUEUE_LENGTH} requests wait while a goal is planned: send it again after a reply"
+        hint = f"{QUEUE_LENGTH} requests wait for a goal before them: send it again after a reply"
         limit = float(QUEUE_LENGTH)
         refusal = RefusalError("BUSY", hint, value=float(len(waiting)), threshold=limit, unit="requests")
         _reply_refused(request, refusal, context)
 
 
 def answer_waiting(context: StepContext) -> None:
-    """Answer the requests that have waited for a plan."""
+    """Answer the requests that have waited for a plan, or for a kept model to be confirmed."""
     waiting = context.state.waiting
-    while waiting and _free(context):
+    while waiting and _free(waiting[0], context):
         _answer(waiting.pop(0), context)
+    comparison = context.state.comparison
+    if comparison is not None and not waiting:
+        comparison.wait_until_ns = 0
 
 
-def _free(context: StepContext) -> bool:
-    """Whether the next request may be handled: no goal is planned before it, and no other goal was handled in this
-    step.
+def _free(request: Request, context: StepContext) -> bool:
+    """Whether the next ``request`` may be handled: no goal is planned before it, no other goal was handled in this
+    step, and it does not wait for a kept model to be confirmed.
     """
-    return not planning_pending(context) and not context.goals_read
+    return not planning_pending(context) and not context.goals_read and not _awaits_model(request, context)
+
+
+CONFIRMATION_S = 3.0
+"""Longest time that goals wait for a kept model to be confirmed [s]."""
+
+
+def _awaits_model(request: Request, context: StepContext) -> bool:
+    """Whether a goal waits for frames that confirm a kept model; goals that are refused anyway do not."""
+    state, command, comparison = context.state, request.command, context.state.comparison
+    if comparison is None or state.readiness is not ModelReadiness.UNCONFIRMED or state.reanchoring is not None:
+        return False
+    forbidden = state.lifecycle is not Lifecycle.ACTIVE or state.stopped or state.held
+    if not isinstance(command, RunGoal) or (forbidden and not command.goal.check):
+        return False
+    if isinstance(command.goal.target, JointTarget):
+        return False
+    if not comparison.wait_until_ns:
+        comparison.wait_until_ns = context.now_ns + round(CONFIRMATION_S * 1e9)
+    return context.now_ns < comparison.wait_until_ns
 
 
 def _answer(request: Request, context: StepContext) -> None:
@@ -461,6 +484,8 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
         raise RefusalError("NO_TRIALS", "the cell file has no [calibration] section")
     if command.reset_zeros and not command.check:
         raise RefusalError("RESET_WITHOUT_CHECK", "joint zeros are reset by a check: give check as well as reset_zeros")
+    if command.quick and not command.check:
+        raise RefusalError("QUICK_WITHOUT_CHECK", "only a check can be quick: give check as well as quick")
     if MOTION_SOURCES[type(state.source)].measures and goal_of(state.source) == command.id:
         return "already accepted"  # a client's retry
     new_id(command.id, context)
@@ -471,7 +496,7 @@ def _calibrate(command: Calibrate, request: Request, context: StepContext) -> st
     elif state.model is None:
         raise no_model(context, "the cell has no model to check: calibrate first")
     else:
-        visiting = start_check(command.id, context, state.model, command.reset_zeros)
+        visiting = start_check(command, context, state.model)
         what = "check motion begins"
     preempt(context, "calibrate")
     state.source = visiting

@@ -358,9 +358,9 @@ def prepare(
         return joint_goal(goal, target, context)
     if isinstance(target, TaughtTarget):
         raise RefusalError("TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name)
-    epoch = trusted_model(context)
     if context.state.reanchoring is not None:
         refuse_while_moved(context.state)
+    epoch = trusted_model(context)
     if isinstance(target, IncidenceTarget):
         return start_incidence(goal, target, context, place_now(context) if place is None else place)
     _, law = law_of(goal, context)
@@ -434,4 +434,7 @@ def trusted_model(context: StepContext) -> int:
             "MODEL_SUSPECT",
             "the model no longer explains the images: check the cameras and the markers, then calibrate",
         )
+    if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
+        r = state.comparison.reason
+        raise RefusalError(r.code, r.hint, subject=r.subject, value=r.value, threshold=r.threshold, unit=r.unit)
     return state.model.epoch

@@ -128,12 +128,22 @@ class LinearisedProblem:
         """Whether observations of weight ``believed`` (c, k) [1/px] are noise: in each camera together, and each of
         them.
         """
+        value, limit, _ = self.worst_test(believed)
+        return value <= limit
+
+    def worst_test(self, believed: FloatArray) -> tuple[float, float, int]:
+        """Chi-square and limit of that test of `explained` which is largest relative to its limit, and the camera's
+        row.
+        """
         squares = ((self.innovation * believed[..., None]) ** 2).sum(axis=-1)
-        counts = 2.0 * (believed > 0.0).sum(axis=1)
-        together = all(
-            float(total) <= improbable(float(count)) for total, count in zip(squares.sum(axis=1), counts, strict=True)
-        )
-        return together and float(squares.max()) <= gate_threshold(self.settings.gate_sigma)
+        squares[np.isnan(squares)] = np.inf
+        gate = gate_threshold(self.settings.gate_sigma)
+        tests = []
+        for row, (each, count) in enumerate(zip(squares, (believed > 0.0).sum(axis=1), strict=True)):
+            tests.append((float(each.max()), gate, row))
+            if count:
+                tests.append((float(each.sum()), improbable(2.0 * float(count)), row))
+        return max(tests, key=lambda test: test[0] / test[1])
 
     def diagnose(self, row: int | None = None, *, static_alone: bool = False) -> ChangeDiagnosis:
         """The most probable change seen by all cameras, or by the one of a ``row``; ``static_alone``: without the

@@ -2,7 +2,8 @@
 then tested against the model in use, without a fit.
 
 At stop l joint l is above, and the next joint below its base, so that every joint is observed on both sides and against
-the others, with one stop a joint plus the base. `calibration.change.model_check` evaluates the pixels.
+the others, with one stop a joint plus the base. The quick check has two stops around the present posture, at which all
+joints are displaced. `calibration.change.model_check` evaluates the pixels.
 """
 
 from __future__ import annotations
@@ -30,14 +31,49 @@ from stereoservo.core.sources.measure_at_pose import (
 )
 from stereoservo.core.state import CheckMotion
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.goals import Calibrate
 from stereoservo.numerics.arrays import FloatArray
 
 SHARE = 0.5
 """Fraction of the range to one side of its base in which a joint was driven for the model's calibration."""
 
 
+QUICK_S = 2.0
+"""Time [s] of the three moves of the quick check, without the approach to their ends, which takes less than a third of
+a second each: together at most three seconds.
+"""
+
+
+def quick_targets(settings: CoreSettings, model: CellModel, q: FloatArray) -> FloatArray:
+    """Configurations (4, n) of the quick check: ``q`` (n,), the posture in which the arm rests, first and last."""
+    limits = settings.limits
+    # A move of length d takes d / v + 4 v / 3 a with braking at `BRAKE_SHARE` a; the moves are d, 2 d and d long.
+    speed = limits.velocity_max * (limits.speed_scale * trial_settings(settings).speed_scale)
+    speed = np.minimum(speed, QUICK_S / 8.0 * limits.acceleration_max)
+    reach = speed * (QUICK_S / 4.0 - speed / limits.acceleration_max)
+    step = np.minimum(reach, _steps(settings, model, q))
+    joint = np.arange(q.size)
+    return np.array([q, q + step * (1 - 2 * (joint % 2)), q + step * (1 - 2 * (joint // 2 % 2)), q])
+
+
 def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
     """Configurations (s, n) of the check motion, the base first and last."""
+    base = trial_settings(settings).base
+    step, n = _steps(settings, model, base), base.size
+    stops = [base]
+    for joint in range(n):
+        stop = base.copy()
+        stop[joint] += step[joint]
+        if n > 1:
+            stop[(joint + 1) % n] -= step[(joint + 1) % n]
+        stops.append(stop)
+    if n == 1:
+        stops.append(base - step)
+    return np.array([*stops, base])
+
+
+def _steps(settings: CoreSettings, model: CellModel, middle: FloatArray) -> FloatArray:
+    """Largest displacements (n,) of the joints to either side of the ``middle`` (n,)."""
     trial = trial_settings(settings)
     driven = trial.range.copy()
     if model.statistics is not None:
@@ -45,32 +81,23 @@ def check_targets(settings: CoreSettings, model: CellModel) -> FloatArray:
         driven = np.array([known.get(name, r) for name, r in zip(settings.joint_names, driven, strict=True)])
     limits = settings.limits
     margin = limits.position_margin + 4.0 * settings.arrival
-    room = np.minimum(limits.position_max - margin - trial.base, trial.base - limits.position_min - margin)
-    step = np.maximum(np.minimum(SHARE * np.where(np.isfinite(driven), driven, 0.1), room), 0.0)
-    n = trial.base.size
-    stops = [trial.base]
-    for joint in range(n):
-        stop = trial.base.copy()
-        stop[joint] += step[joint]
-        if n > 1:
-            stop[(joint + 1) % n] -= step[(joint + 1) % n]
-        stops.append(stop)
-    if n == 1:
-        stops.append(trial.base - step)
-    return np.array([*stops, trial.base])
+    room = np.minimum(limits.position_max - margin - middle, middle - limits.position_min - margin)
+    return np.maximum(np.minimum(SHARE * np.where(np.isfinite(driven), driven, 0.1), room), 0.0)
 
 
-def start_check(goal_id: str, context: StepContext, model: CellModel, reset_zeros: bool = False) -> CheckMotion:
-    """The check motion before its first move, to the base. ``reset_zeros`` is reported when it has finished."""
-    targets = check_targets(context.settings, model)
-    fields = first_visit(targets[0], context.q, context.now_ns, context.settings)
+def start_check(command: Calibrate, context: StepContext, model: CellModel) -> CheckMotion:
+    """The check motion of a ``command`` before its first move, to the base or, if it is quick, none."""
+    settings = context.settings
+    targets = quick_targets(settings, model, context.q) if command.quick else check_targets(settings, model)
+    fields = first_visit(targets[0], context.q, context.now_ns, settings)
     return CheckMotion(
-        id=goal_id,
+        id=command.id,
         lease_s=None,
         lease_until_ns=0,
         targets=targets,
         index=0,
-        reset_zeros=reset_zeros,
+        reset_zeros=command.reset_zeros,
+        quick=command.quick,
         **fields,  # type: ignore[arg-type]
     )
 
@@ -85,7 +112,8 @@ def check_step(checking: CheckMotion, context: StepContext) -> SourceOutput:
             return rest(context)
         poorest = too_few_seen(samples, trial, context.settings.scene_ids)
         if poorest is not None and checking.index == 0:
-            return abort(checking, context, unseen_at_base(poorest, trial, context.settings.scene_ids))
+            where = "where the arm rests" if checking.quick else "at the base"
+            return abort(checking, context, unseen_at_base(poorest, trial, context.settings.scene_ids, where))
         if poorest is None:
             checking.seen += 1
         context.emit(

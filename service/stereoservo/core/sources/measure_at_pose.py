@@ -166,8 +166,12 @@ def too_few_seen(samples: tuple[Sample, ...], trial: TrialSettings, static: tupl
     return None
 
 
-def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...] = ()) -> Reason:
-    """Why the programme cannot start: too few markers are visible at the base; ``static`` points do not count."""
+def unseen_at_base(
+    poorest: Sample, trial: TrialSettings, static: tuple[int, ...] = (), where: str = "at the base"
+) -> Reason:
+    """Why the programme cannot start: too few markers are visible ``where`` it begins; ``static`` points do not
+    count.
+    """
     seen = _of_body(poorest.ids, static)
     if poorest.frames == 0:
         return Reason(
@@ -187,7 +191,7 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
             float(poorest.frames),
             float(trial.frames),
             "frames",
-            f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames at the base in "
+            f"camera {poorest.camera} delivered {poorest.frames} of {trial.frames} frames {where} in "
             f"{trial.wait_s:g} s: a slow or interrupted camera; see the daemon's log, or raise calibration.wait_s",
         )
     return Reason(
@@ -197,8 +201,8 @@ def unseen_at_base(poorest: Sample, trial: TrialSettings, static: tuple[int, ...
         float(seen),
         float(trial.min_markers),
         "markers",
-        f"camera {poorest.camera} shows {seen} markers in {poorest.frames} frames at the base: "
-        "check light, focus, and that the base configuration shows the marker body to every camera",
+        f"camera {poorest.camera} shows {seen} markers in {poorest.frames} frames {where}: "
+        "check light, focus, and that every camera sees the marker body there",
     )
 
 

@@ -205,7 +205,8 @@ function showState({ state: s, predicted, scene: shape, refinement }) {
   state = s;
   showHead();
   const unseen = s.health.verdict === "unknown" && s.health.text;
-  badge("model", `model ${s.model}${unseen ? ", unseen" : ""}`, unseen ? "warn" : { valid: "good", suspect: "warn" }[s.model]);
+  const readiness = s.model === "unconfirmed" ? "kept, not confirmed" : s.model;
+  badge("model", `model ${readiness}${unseen ? ", unseen" : ""}`, unseen ? "warn" : { valid: "good", suspect: "warn", unconfirmed: "warn" }[s.model]);
   badge("error", s.error_px !== null ? `error ${s.error_px.toFixed(2)} px` : s.goal ? "error unknown" : "no error");
   badge("activity", s.goal ? `${s.source} ${s.progress === null ? "" : Math.round(100 * s.progress) + " %"}` : s.source);
   const texts = s.reasons.map((r) => `${r.code}${r.subject ? ` ${r.subject}` : ""}: ${r.hint}`).concat(s.notes, s.health.text && s.health.verdict !== "ok" ? [s.health.text] : []);
