@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from stereoservo.calibration.change.model_changes import known_measurements
-from stereoservo.calibration.change.refinement import LEAST_POSES, estimate_step, refine_model
+from stereoservo.calibration.change.refinement import estimate_step, refine_model
 from stereoservo.calibration.rig_model import acting_order
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.trial_data import LEAST_POSES, CalibrationError, TrialData
 from stereoservo.kinematics.covariance import (
     covariance_axes,
     displaced_model,

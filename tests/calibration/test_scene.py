@@ -4,12 +4,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration.static_points import static_observations, with_static_points
+from stereoservo.calibration.static_points import with_static_points
 from stereoservo.calibration.trial_data import (
     CalibrationError,
     StaticObservations,
     decode_trials,
     encode_trials,
+    static_observations,
 )
 from stereoservo.geometry.cameras import project
 from stereoservo.kinematics.model import ModelFileError, decode_model, encode_model

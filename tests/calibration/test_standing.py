@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereoservo.calibration.static_points import static_markers
+from stereoservo.calibration.trial_data import static_markers
 from stereoservo_sim.world.synthetic import flat_plate, gantry, rx90
 
 

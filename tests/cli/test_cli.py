@@ -436,16 +436,16 @@ def test_warmup_of_a_cell_makes_its_detectors_too(
 
 def test_warmup_tells_how_far_it_is_once_it_is_farther(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     class Compiling:
-        """A process that compiles in steps, and ends well."""
+        """A process that compiles in steps, and ends well. At 0 its progress cannot be read."""
 
-        done = iter([3, 3, 40])
+        done = iter([0, 3, 3, 0, 40])
 
         def wait(self, timeout_s: float) -> int:
             done = next(self.done, None)
             if done is None:
                 return 0
-            told = CompilationProgress("rest", 1, done, 300)
-            progress_path(tmp_path, "rest").write_bytes(msgspec.json.encode(told))
+            told = msgspec.json.encode(CompilationProgress("rest", 1, done, 300)) if done else b""
+            progress_path(tmp_path, "rest").write_bytes(told)
             raise subprocess.TimeoutExpired("compile", timeout_s)
 
     assert _wait(Compiling(), tmp_path) == 0  # type: ignore[arg-type]

@@ -13,13 +13,8 @@ from stereoservo.recording import ring as ring_module
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.ring import FlightRing, RingLimits, RingThread
 from stereoservo.recording.step_layout import encode_step
-from stereoservo.recording.step_records import (
-    RecordedCheckpoint,
-    RecordedStep,
-    RecordingStart,
-    StepMessage,
-    fingerprint,
-)
+from stereoservo.recording.step_messages import RecordedCheckpoint, RecordedStep, RecordingStart, StepMessage
+from stereoservo.recording.step_records import fingerprint
 
 MIB = 1 << 20
 CHECKPOINT_EVERY = 25

@@ -33,7 +33,8 @@ from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, replay
 from stereoservo.recording.step_layout import decode_step, encode_step, outputs_crc, result_crc
-from stereoservo.recording.step_records import Fingerprint, fingerprint
+from stereoservo.recording.step_messages import Fingerprint
+from stereoservo.recording.step_records import fingerprint
 
 
 def record(

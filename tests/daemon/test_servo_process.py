@@ -65,7 +65,7 @@ from stereoservo.ports.devices import (
 )
 from stereoservo.recording import step_records
 from stereoservo.recording.step_layout import decode_step
-from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart
+from stereoservo.recording.step_messages import RecordedCheckpoint, RecordedStep, RecordingStart
 
 RATE_HZ = 250.0
 JOINTS = tuple(JointSpec(f"j{k}", "revolute", -2.0, 2.0, 1.0, 4.0) for k in (1, 2))

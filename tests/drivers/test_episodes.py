@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from lerobot_sets import CAMERAS, FPS, UNITS, Episode, changed, rewritten, write, write_in_av1
-from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
+from stereoservo.daemon.cell_preparation import make_plan
+from stereoservo.daemon.ipc_messages import PlanOptions
 from stereoservo.ports.clock import VirtualClock
 from stereoservo.ports.devices import CameraDriver, DriverContext, DriverError
 from stereoservo_drivers.contracts import CameraDriverContract

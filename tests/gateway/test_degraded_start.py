@@ -35,7 +35,8 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.run_record import begin_run, end_run, read_goals, read_run
 from stereoservo.messages.wire import EventMessage
 from stereoservo.recording import flight_recorder
-from stereoservo.recording.step_records import RecordedStep, RecordingStart, fingerprint
+from stereoservo.recording.step_messages import RecordedStep, RecordingStart
+from stereoservo.recording.step_records import fingerprint
 
 MODEL = example_model()
 SETTINGS = example_settings()

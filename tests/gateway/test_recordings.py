@@ -20,7 +20,8 @@ from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.recording_request import RecordedImages, read_request, request_path
 from stereoservo.messages.wire import EventMessage, decode
 from stereoservo.recording.ring import RingLimits
-from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, fingerprint
+from stereoservo.recording.step_messages import RecordedCheckpoint, RecordedStep, RecordingStart
+from stereoservo.recording.step_records import fingerprint
 
 
 class Settings(msgspec.Struct):

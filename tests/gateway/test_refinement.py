@@ -14,10 +14,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from stereoservo.calibration.change.refinement import LEAST_POSES, RefinementReport
+from stereoservo.calibration.trial_data import LEAST_POSES
 from stereoservo.core.cycle import Event, Sample, Status
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.jobs.refinement_job import APART, MOST_POSES, RestPoses
+from stereoservo.daemon.jobs.rest_poses import APART, MOST_POSES, RestPoses
 from stereoservo.daemon.kernel_compilation import example_model, example_settings
 from stereoservo.daemon.taught_goals import taught_goal
 from stereoservo.gateway import model_updates, persistence
@@ -26,6 +26,7 @@ from stereoservo.gateway.model_updates import RefinementJobs
 from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages import files as files_module
+from stereoservo.messages.check_report import RefinementReport
 from stereoservo.messages.goals import TaughtTarget
 from stereoservo.messages.status import Health, RefinementState
 from stereoservo.messages.wire import MessageError, RunningGoals

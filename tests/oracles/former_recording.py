@@ -13,7 +13,7 @@ from mcap.writer import CompressionType, Writer
 from stereoservo.core.cycle import StepInputs, StepOutputs, encode
 from stereoservo.core.settings import CoreSettings
 from stereoservo.recording.step_layout import StepRecord
-from stereoservo.recording.step_records import Fingerprint
+from stereoservo.recording.step_messages import Fingerprint
 
 
 def encode_step(inputs: StepInputs, outputs: StepOutputs) -> bytes:

@@ -4,11 +4,8 @@ and their triangulation into the model with its covariance.
 
 from __future__ import annotations
 
-import warnings
-
 import msgspec
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import chi2 as chi2_distribution
 
 from stereoservo.calibration.least_squares import DenseFit, Limits, minimise
@@ -156,60 +153,3 @@ def _covariance(
     rows = rows.reshape(2 * count, parameters_of(model))
     widened: FloatArray = covariance + rows @ model.covariance.covariance @ rows.T
     return widened
-
-
-NOISE = 5.0
-"""Most standard deviations by which a static marker deviates from its median ..."""
-LEAST_PX = 0.3
-"""... or largest deviation [px], as from a shaking table ..."""
-SHARE = 0.1
-"""... and largest share of the displacement of the marker that moves most."""
-
-MOVING_SIGMAS = 0.25
-"""Share of a camera's stops at which a static marker may be displaced, for example behind the arm."""
-
-STOPS = 4
-"""Least number of stops at which one camera must see a marker to classify it as static."""
-
-
-def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.bool_]:
-    """Mask (m,) of the markers that are static over all stops. ``pixels`` (c, s, m, 2), NaN where missing.
-
-    ``sigmas`` (c, s, m) [px]. All false if nothing moves.
-    """
-    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
-    count = seen.sum(axis=1)
-    known = np.where(seen[..., None], pixels, 0.0)
-    mean = known.sum(axis=1) / np.maximum(count, 1)[..., None]
-    squares = np.where(seen, ((known - mean[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
-    total = np.maximum(seen.sum(axis=(0, 1)), 1)
-    deviation = np.sqrt(squares / total)
-    noise = np.sqrt(2.0 * np.where(seen, sigmas**2, 0.0).sum(axis=(0, 1)) / total)
-    still = (deviation <= np.maximum(NOISE * noise, LEAST_PX)) & (deviation <= SHARE * deviation.max(initial=0.0))
-    return np.asarray(still & (count.max(axis=0) >= STOPS))
-
-
-def static_observations(
-    ids: tuple[int, ...], pixels: FloatArray, sigmas: FloatArray
-) -> tuple[StaticObservations | None, tuple[int, ...]]:
-    """Mean observations of markers ``ids`` (k,) that are stated to be static, and the ids of those that moved.
-
-    ``pixels`` (c, s, k, 2) of all stops, NaN where missing, and ``sigmas`` (c, s, k) [px]. In each camera it is the
-    median over the stops, so that a stop at which the arm covers half of a marker has no effect; its sigma is that of
-    one stop, since systematic errors do not average out. A marker that deviates from its median at more than a quarter
-    of a camera's stops has moved, and is left out.
-    """
-    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # a marker that a camera never sees stays NaN
-        mean = np.nanmedian(pixels, axis=1)
-        sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
-    away = np.linalg.norm(pixels - mean[:, None], axis=-1)
-    moving = seen & (away > np.maximum(NOISE * np.sqrt(2.0) * sigma, LEAST_PX)[:, None])
-    moved = (moving.sum(axis=1) > MOVING_SIGMAS * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
-    kept = ~moved & seen.any(axis=(0, 1))
-    named = tuple(marker for marker, one in zip(ids, moved, strict=True) if one)
-    if not kept.any():
-        return None, named
-    left = tuple(marker for marker, one in zip(ids, kept, strict=True) if one)
-    return StaticObservations(left, mean[:, kept], sigma[:, kept]), named

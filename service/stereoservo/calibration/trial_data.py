@@ -5,6 +5,7 @@ npz file that stores them.
 from __future__ import annotations
 
 import io
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -22,6 +23,8 @@ from stereoservo.numerics.arrays import FloatArray, IntArray
 
 TRIALS_SCHEMA = 1
 MAX_TRIALS_BYTES = 1 << 30
+LEAST_POSES = 16
+"""Number of rest poses from which a model is refined."""
 LOADS = "loads_"
 STATIC = "static_"
 WAY = "way_"
@@ -463,3 +466,76 @@ def load_trials(path: Path) -> TrialData:
     """Read and check trial data. Raises CalibrationError (``bad_data``)."""
     with decoding(partial(_bad, path), (CalibrationError,)):
         return decode_trials(read_bounded(path, MAX_TRIALS_BYTES), path)
+
+
+def trials_file(model_path: Path, epoch: int) -> Path:
+    """File of the trial data of the calibration with this epoch."""
+    return model_path.with_name(f"trials-{epoch:06d}.npz")
+
+
+def report_folder(model_path: Path) -> Path:
+    """Folder of a model's report; its page is ``index.html``."""
+    return model_path.with_name(f"{model_path.stem}-report")
+
+
+def figures_file(model_path: Path) -> Path:
+    """File of the figures of a model's fit, for programs."""
+    return model_path.with_name(f"{model_path.stem}-report.json")
+
+
+# -- static markers --
+
+STATIC_SIGMAS = 5.0
+"""Most standard deviations by which a static marker deviates from its median ..."""
+STATIC_PX = 0.3
+"""... or largest deviation [px], as from a shaking table ..."""
+STATIC_SHARE = 0.1
+"""... and largest share of the displacement of the marker that moves most."""
+MOVING_SHARE = 0.25
+"""Share of a camera's stops at which a static marker may be displaced, for example behind the arm."""
+STATIC_STOPS = 4
+"""Least number of stops at which one camera must see a marker to classify it as static."""
+
+
+def static_markers(pixels: FloatArray, sigmas: FloatArray) -> npt.NDArray[np.bool_]:
+    """Mask (m,) of the markers that are static over all stops. ``pixels`` (c, s, m, 2), NaN where missing.
+
+    ``sigmas`` (c, s, m) [px]. All false if nothing moves.
+    """
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    count = seen.sum(axis=1)
+    known = np.where(seen[..., None], pixels, 0.0)
+    mean = known.sum(axis=1) / np.maximum(count, 1)[..., None]
+    squares = np.where(seen, ((known - mean[:, None]) ** 2).sum(axis=-1), 0.0).sum(axis=(0, 1))
+    total = np.maximum(seen.sum(axis=(0, 1)), 1)
+    deviation = np.sqrt(squares / total)
+    noise = np.sqrt(2.0 * np.where(seen, sigmas**2, 0.0).sum(axis=(0, 1)) / total)
+    noisy = deviation <= np.maximum(STATIC_SIGMAS * noise, STATIC_PX)
+    still = noisy & (deviation <= STATIC_SHARE * deviation.max(initial=0.0))
+    return np.asarray(still & (count.max(axis=0) >= STATIC_STOPS))
+
+
+def static_observations(
+    ids: tuple[int, ...], pixels: FloatArray, sigmas: FloatArray
+) -> tuple[StaticObservations | None, tuple[int, ...]]:
+    """Mean observations of markers ``ids`` (k,) that are stated to be static, and the ids of those that moved.
+
+    ``pixels`` (c, s, k, 2) of all stops, NaN where missing, and ``sigmas`` (c, s, k) [px]. In each camera it is the
+    median over the stops, so that a stop at which the arm covers half of a marker has no effect; its sigma is that of
+    one stop, since systematic errors do not average out. A marker that deviates from its median at more than a quarter
+    of a camera's stops has moved, and is left out.
+    """
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # a marker that a camera never sees stays NaN
+        mean = np.nanmedian(pixels, axis=1)
+        sigma = np.nanmedian(np.where(seen, sigmas, np.nan), axis=1)
+    away = np.linalg.norm(pixels - mean[:, None], axis=-1)
+    moving = seen & (away > np.maximum(STATIC_SIGMAS * np.sqrt(2.0) * sigma, STATIC_PX)[:, None])
+    moved = (moving.sum(axis=1) > MOVING_SHARE * np.maximum(seen.sum(axis=1), 1)).any(axis=0)
+    kept = ~moved & seen.any(axis=(0, 1))
+    named = tuple(marker for marker, one in zip(ids, moved, strict=True) if one)
+    if not kept.any():
+        return None, named
+    left = tuple(marker for marker, one in zip(ids, kept, strict=True) if one)
+    return StaticObservations(left, mean[:, kept], sigma[:, kept]), named

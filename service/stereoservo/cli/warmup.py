@@ -61,17 +61,15 @@ def _wait(process: subprocess.Popen[bytes], told: Path) -> int:
             return process.wait(REPORT_EVERY_S)
         except subprocess.TimeoutExpired:
             progress = read_progress(told)
-        if progress != known:
+        if progress and progress != known:
             known = progress
             log(f"compiling: {progress[0].text}")
 
 
 def _warm_up_detectors(cell: str) -> None:
     """Construct the drivers and detectors of a cell, which compiles missing kernels. Raises as `make_plan`."""
-    from stereoservo.daemon.cell_preparation import (  # not for --help: numerical libraries
-        PlanOptions,
-        make_plan,
-    )
+    from stereoservo.daemon.cell_preparation import make_plan
+    from stereoservo.daemon.ipc_messages import PlanOptions
     from stereoservo.messages.cell_file import load_cell_file
 
     path = shipped_or_path(cell).absolute()

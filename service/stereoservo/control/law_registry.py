@@ -12,13 +12,24 @@ import hashlib
 import inspect
 import pathlib
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NoReturn
 
-from stereoservo.control.law import Law, Path
+import msgspec
+
+from stereoservo.control.law import Law, OneCamera, Path
 from stereoservo.ports import plugins
 
 OPTIONS = ("centre", "jacobian", "profile")
 """Fields of a goal that belong to some laws only."""
+
+
+class LawDescription(msgspec.Struct, frozen=True):
+    """The properties of a law by which requests are checked (see `Law`), for processes that step none."""
+
+    name: str
+    summary: str
+    options: tuple[str, ...]
+    one_camera: OneCamera
 
 
 class UnknownLawError(KeyError):
@@ -85,6 +96,19 @@ class LawRegistry(Mapping[str, Law]):
         """All names, ordered by how reliably a law arrives: on a straight line, by the goal's pose, by its pixels."""
         return tuple(sorted(self, key=lambda name: (self[name].path != "straight", not self[name].needs_pose)))
 
+    def descriptions(self) -> tuple[LawDescription, ...]:
+        """The usable laws in their order, for `adopt` in another process."""
+        return tuple(LawDescription(name, law.summary, law.options, law.one_camera) for name, law in self.items())
+
+    def adopt(self, laws: tuple[LawDescription, ...], errors: Mapping[str, str]) -> None:
+        """Hold these laws of another process, and its ``errors``, in place of the installed ones: no law is imported,
+        and none can be stepped.
+        """
+        self._laws = {
+            law.name: Law(_not_here, law.summary, options=law.options, one_camera=law.one_camera) for law in laws
+        }
+        self._errors = dict(errors)
+
     def sources(self) -> dict[str, str]:
         """Source of every law: its distribution with its version, and a hash of its source file."""
         found = {}
@@ -103,6 +127,10 @@ class LawRegistry(Mapping[str, Law]):
                     self._errors[name] = str(error)
             self._laws = dict(sorted(laws.items(), key=lambda item: (item[1].rank, item[0])))
         return self._laws
+
+
+def _not_here(*_: Any) -> NoReturn:
+    raise RuntimeError("this process holds only descriptions of the laws (LawRegistry.adopt); it cannot step one")
 
 
 def source_hash(law: Law) -> str:

@@ -18,6 +18,9 @@ from stereoservo.messages.status import CoreStatus
 from stereoservo.numerics.arrays import FloatArray, IntArray
 from stereoservo.ports.devices import CameraObservation, JointState, Prior
 
+RESET_ZEROS = "reset_zeros"
+"""Name of a ``check_finished`` event after which drifted joint zeros are to be reset."""
+
 
 class DriverFault(msgspec.Struct, frozen=True):
     """A joint driver failed in this cycle."""

@@ -11,6 +11,7 @@ import numpy as np
 
 from stereoservo.control.law_registry import LAWS, UnknownLawError
 from stereoservo.messages.cell_file import (
+    MAX_JOINTS,
     MAX_MARKERS,
     CellFile,
     CellFileError,
@@ -175,6 +176,15 @@ def _arrival(resolution: tuple[float, ...], joints: int) -> FloatArray:
     tolerance: FloatArray = np.maximum(FINEST_ARRIVAL, ARRIVAL_STEPS * steps)
     tolerance.setflags(write=False)
     return tolerance
+
+
+MIN_MARKERS = 3
+"""Number of markers that determine the pose of a free body."""
+RIGID_FREEDOMS = 6
+FEWEST_MARKERS = (1,) * RIGID_FREEDOMS + (MIN_MARKERS,) * (MAX_JOINTS + 1 - RIGID_FREEDOMS)
+"""Least number of markers that a goal has to show, by the number of joints. For an arm of fewer than six joints fewer
+are sufficient, because the goal must be reachable.
+"""
 
 
 def core_settings(

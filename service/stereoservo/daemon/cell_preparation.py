@@ -16,8 +16,9 @@ from pathlib import Path
 
 import msgspec
 
+from stereoservo.control.law_registry import LAWS
 from stereoservo.daemon.camera_setup import describe_camera, make_camera
-from stereoservo.daemon.ipc_messages import RunPlan, save_plan
+from stereoservo.daemon.ipc_messages import PlanOptions, RunPlan, save_plan
 from stereoservo.daemon.kernel_compilation import collect_seldom, tell_progress, warm_up_first
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
@@ -33,16 +34,6 @@ from stereoservo.ports.devices import (
 )
 
 EXIT_INVALID = 2
-
-
-class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Options of a run that are not in the cell file."""
-
-    boot: str
-    seed: int = 0
-    dry_run: bool = False
-    commissioning: bool = False
-    record: str = ""
 
 
 @contextmanager
@@ -103,6 +94,7 @@ def make_plan(cell_path: Path, runtime: Path, state: Path, options: PlanOptions)
         cell=cell, cell_path=str(cell_path), runtime=str(runtime), state=str(state), boot=options.boot,
         joints=joints, cameras=cameras, seed=options.seed, dry_run=options.dry_run,
         commissioning=options.commissioning, record=options.record,
+        laws=LAWS.descriptions(), law_errors=dict(LAWS.errors),
     )  # fmt: skip
     try:
         plan.settings()

@@ -13,6 +13,7 @@ from typing import BinaryIO
 import msgspec
 import numpy as np
 
+from stereoservo.control.law_registry import LawDescription
 from stereoservo.core.cycle import Event, Status, StepInputs, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.kinematics.model import CellModel
@@ -32,7 +33,7 @@ from stereoservo.ports.devices import (
     JointDriverDescription,
     Prior,
 )
-from stereoservo.recording.step_records import RecordedStep, StepMessage
+from stereoservo.recording.step_messages import RecordedStep, StepMessage
 
 OBSERVATION_LAYOUT = "CameraObservation.2"
 PRIOR_LAYOUT = "Prior.2"
@@ -41,6 +42,16 @@ PRIOR_CAPACITY = 1 << 16
 STATE_CAPACITY = 1 << 16
 PIXEL_STEP = 2.0**-12
 """Quantization step of detected pixels [px]; it adds a noise of 0.00007 px."""
+
+
+class PlanOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Options of a run that are not in the cell file."""
+
+    boot: str
+    seed: int = 0
+    dry_run: bool = False
+    commissioning: bool = False
+    record: str = ""
 
 
 class RunPlan(msgspec.Struct, frozen=True):
@@ -57,6 +68,8 @@ class RunPlan(msgspec.Struct, frozen=True):
     dry_run: bool = False
     commissioning: bool = False
     record: str = ""
+    laws: tuple[LawDescription, ...] = ()
+    law_errors: dict[str, str] = {}
 
     @property
     def directories(self) -> CellDirectories:

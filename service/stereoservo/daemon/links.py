@@ -14,7 +14,7 @@ from stereoservo.daemon.ipc_messages import ServoState
 from stereoservo.messages.goals import Request
 from stereoservo.messages.servo_state import LoopStatistics
 from stereoservo.ports.devices import CameraObservation, Prior
-from stereoservo.recording.step_records import StepSink
+from stereoservo.recording.step_messages import StepSink
 
 
 class GatewayMessages(NamedTuple):

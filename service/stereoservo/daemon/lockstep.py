@@ -38,7 +38,7 @@ from stereoservo.ports.devices import (
     Prior,
 )
 from stereoservo.recording.flight_recorder import FlightRecorder
-from stereoservo.recording.step_records import RecordingStart, StepMessage
+from stereoservo.recording.step_messages import RecordingStart, StepMessage
 
 REPLY_TIMEOUT_S = 60.0
 """Virtual time limit of a reply [s]: a goal is planned before it is answered."""

@@ -159,17 +159,22 @@ def clock_pacing(period_ns: int) -> ClockPacing:
     return LoggedPacing(period_ns, Path(log)) if log else ClockPacing(period_ns)
 
 
+def release_memory() -> None:
+    """Return memory that is unused after loading to the system, and have the garbage collector skip what is loaded."""
+    gc.collect()
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if trim is not None:  # glibc only; other libraries keep less freed memory
+        trim(0)
+    gc.freeze()
+
+
 def prepare_realtime(priority: int) -> list[str]:
     """Release memory that is unused after loading, freeze the garbage collector's generations and request SCHED_FIFO
     (``priority`` 0: do not change the scheduler).
 
     Returns warnings, each with its remedy; the loop also runs without real-time priority, but may wake late under load.
     """
-    gc.collect()
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if trim is not None:  # glibc only; other libraries keep less freed memory
-        trim(0)
-    gc.freeze()
+    release_memory()
     if priority == 0:
         return []
     try:

@@ -30,7 +30,7 @@ from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.servo_state import STATE_LAYOUT
 from stereoservo.ports.devices import CameraObservation, Prior
-from stereoservo.recording.step_records import StepMessage
+from stereoservo.recording.step_messages import StepMessage
 
 RETAINED_EVENTS = 2048
 """Number of newest events that are kept, even if received: they are all sent to a restarted gateway."""

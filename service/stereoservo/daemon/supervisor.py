@@ -25,7 +25,6 @@ from typing import NoReturn
 import msgspec
 
 from stereoservo.daemon import record_ring
-from stereoservo.daemon.cell_preparation import PlanOptions
 from stereoservo.daemon.channels.reports import Reporter
 from stereoservo.daemon.heartbeat import (
     HEARTBEAT_BYTES,
@@ -41,6 +40,7 @@ from stereoservo.daemon.ipc_messages import (
     PRIOR_LAYOUT,
     STATE_CAPACITY,
     PlanError,
+    PlanOptions,
     RunPlan,
     load_plan,
     save_plan,

@@ -34,6 +34,7 @@ from stereoservo.daemon.ipc_messages import (
     rounded,
 )
 from stereoservo.daemon.links import VisionLinks
+from stereoservo.daemon.pacing import release_memory
 from stereoservo.daemon.process_control import Termination, die_with_parent, write_log
 from stereoservo.daemon.seqlock import SlotError, SlotReader, SlotWriter
 from stereoservo.messages.decoding import RecordBoundary, cause_of
@@ -309,6 +310,7 @@ def run(plan: RunPlan, camera: str, termination: Termination) -> None:
             images.poll_request(clock.now_ns())
         reporter.flush()
 
+    release_memory()
     try:
         with (
             closing(VisionSlots(directories, camera)) as links,

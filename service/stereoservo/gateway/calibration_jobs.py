@@ -16,9 +16,8 @@ import numpy as np
 
 from stereoservo.calibration.fit_assessment import assess_failure
 from stereoservo.calibration.trial_data import CalibrationError
-from stereoservo.core.cycle import TRIALS_BEGIN, Event
+from stereoservo.core.cycle import RESET_ZEROS, TRIALS_BEGIN, Event
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.check import RESET_ZEROS
 from stereoservo.daemon.ipc_messages import store_event
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import CheckJob, ChildJob, FitFailedError, FitJob, calibration_result

@@ -15,8 +15,7 @@ from typing import IO, Any
 import msgspec
 
 from stereoservo.calibration.fit_assessment import Acceptance
-from stereoservo.calibration.trial_data import TrialData, save_trials
-from stereoservo.daemon.jobs.fit_job import figures_file, report_folder, trials_file
+from stereoservo.calibration.trial_data import TrialData, figures_file, report_folder, save_trials, trials_file
 from stereoservo.daemon.process_control import child_environment, write_log
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.messages.check_report import CheckReport, ZeroReset

@@ -11,12 +11,10 @@ from pathlib import Path
 
 import msgspec
 
-from stereoservo.calibration.change.refinement import LEAST_POSES, RefinementReport
-from stereoservo.calibration.trial_data import CalibrationError, save_trials
+from stereoservo.calibration.trial_data import LEAST_POSES, CalibrationError, save_trials
 from stereoservo.core.cycle import Event, Status
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.jobs.refinement_job import MOST_POSES, RestPoses
-from stereoservo.daemon.jobs.relocalization_job import RelocalizationPoses, RelocalizationReport, save_events
+from stereoservo.daemon.jobs.rest_poses import MOST_POSES, RelocalizationPoses, RestPoses, save_events
 from stereoservo.daemon.taught_goals import TaughtGoal
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.child_jobs import ChildJob, FitFailedError
@@ -24,6 +22,7 @@ from stereoservo.gateway.persistence import ModelStore, TaughtStore
 from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.servo_connection import ServoConnection
 from stereoservo.kinematics.model import CellModel, ModelFileError, load_model, save_model
+from stereoservo.messages.check_report import RefinementReport, RelocalizationReport
 from stereoservo.messages.goals import ReanchorRefused
 from stereoservo.messages.status import RefinementState
 from stereoservo.messages.wire import MessageError, RunningGoals

@@ -569,7 +569,10 @@ def main() -> int:
     termination = Termination(grace_s=8.0)
     prepare_runtime()
     try:
-        run(load_plan(runtime), parent, termination)
+        plan = load_plan(runtime)
+        if plan.laws:
+            LAWS.adopt(plan.laws, plan.law_errors)
+        run(plan, parent, termination)
     except (DirectoryError, OSError, PlanError, SessionError, SlotError) as error:
         write_log("gateway", str(error))
         return EXIT_SETUP

@@ -21,7 +21,7 @@ from stereoservo.messages.recording_request import (
 )
 from stereoservo.recording.flight_recorder import FlightRecorder
 from stereoservo.recording.ring import RingLimits, RingThread
-from stereoservo.recording.step_records import RecordingStart, StepMessage
+from stereoservo.recording.step_messages import RecordingStart, StepMessage
 
 REPORT_TIMEOUT_S = 5.0
 """Time limit for vision processes to finish their files [s]; then the gateway reports that they did not."""

@@ -10,7 +10,6 @@ from functools import partial
 
 import msgspec
 
-from stereoservo.control.marker_groups import with_groups
 from stereoservo.core.cycle import Event, encode
 from stereoservo.daemon.channels.seqpacket import ChannelError, PacketChannel
 from stereoservo.daemon.heartbeat import SERVO_HANG_S, HeartbeatReader
@@ -32,7 +31,7 @@ from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Command, Request
 from stereoservo.messages.servo_state import STATE_LAYOUT
-from stereoservo.recording.step_records import StepMessage
+from stereoservo.recording.step_messages import StepMessage
 
 HEARTBEAT_EVERY_S = 0.05
 RECONNECT_EVERY_S = 0.1
@@ -102,7 +101,11 @@ class ServoConnection:
 
         The covariance, which the loop does not use, is omitted: messages have a maximum size.
         """
-        bare = with_groups(msgspec.structs.replace(model, covariance=None))
+        bare = msgspec.structs.replace(model, covariance=None)
+        if bare.marker_groups is None:  # of an older version; the fit stores them, and the gateway needs no kernel
+            from stereoservo.control.marker_groups import with_groups
+
+            bare = with_groups(bare)
         return self._control is not None and self._control.send(encode(NewModel(bare, reanchored, kept)))
 
     def events(self) -> list[Event]:

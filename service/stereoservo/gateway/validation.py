@@ -13,8 +13,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.control.law_registry import LAWS, OPTIONS, UnknownLawError
-from stereoservo.core.goals.marker_body import fewest_markers
-from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.settings import FEWEST_MARKERS, MIN_MARKERS, CameraSettings, CoreSettings
 from stereoservo.messages.goals import (
     AdaptiveGain,
     AuxiliarySpec,
@@ -264,7 +263,6 @@ def _as_json(value: object) -> str:
 __all__ = ["GoalContext", "check_command", "check_goal"]
 
 
-MIN_MARKERS = 3
 POINTS_OF = {"point": 1, "line": 2, "plane": 3}
 SINGULAR = 1e-12
 """Least singular value of a displacement relative to its largest."""
@@ -315,7 +313,7 @@ def check_features(target: FeatureTarget, context: GoalContext, where: str = "ta
             problems += _marker_of_camera(f"{place}.{marker}", marker, camera, context)
             problems += _inside(f"{place}.{marker}", pixel, camera)
             markers.add(marker)
-    needed = fewest_markers(len(context.settings.joint_names))
+    needed = FEWEST_MARKERS[len(context.settings.joint_names)]
     if not problems and len(markers) < needed:
         problems.append(
             f"{where}.set_points: {len(markers)} marker(s) ({listed(sorted(markers))}); at least {needed} fix a pose"
@@ -391,7 +389,7 @@ def check_points(target: PointTarget, context: GoalContext) -> list[str]:
     if problems:
         return problems
     ids = listed(sorted(target.points))
-    needed = fewest_markers(len(context.settings.joint_names))
+    needed = FEWEST_MARKERS[len(context.settings.joint_names)]
     if len(target.points) < needed:
         return [f"target.points: {len(target.points)} marker(s) ({ids}); at least {needed} fix a pose"]
     if len(target.points) < MIN_MARKERS:

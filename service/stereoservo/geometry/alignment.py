@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from scipy.linalg import expm
 
 from stereoservo.geometry.cameras import (
     check_views,
@@ -201,6 +200,8 @@ class ImageConstraints(Protocol):
 
 def descend(T: FloatArray, generators: FloatArray, views: ImageConstraints) -> FloatArray:
     """Gauss-Newton on the group; the whitening follows the solution, and is fixed within a step."""
+    from scipy.linalg import expm  # here, so that a gateway that aligns nothing does without scipy
+
     for _ in range(ITERATIONS):
         whitening = views.whitening(T)
         residuals = views.residuals(T, whitening)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from stereoservo.geometry.cameras import project_many, triangulation_covariance
 from stereoservo.geometry.homogeneous import GeometryError, unit_rows
@@ -285,6 +284,8 @@ def homography_refine_incidences(
     Raises GeometryError for fewer than 15 pixel errors, ``images`` of a different number of cameras, and an
     undetermined H.
     """
+    from scipy.optimize import least_squares  # here, so that a gateway that aligns nothing does without scipy
+
     Ps = np.asarray(Ps, dtype=np.float64)
     points = np.concatenate([incidence.first for incidence in incidences])
     targets = _PixelTargets.of(incidences, len(Ps))

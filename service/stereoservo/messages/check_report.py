@@ -1,5 +1,5 @@
-"""Report of a model check as structs: residuals, detected changes, estimates of drifts, and joint zeros that were
-reset.
+"""Reports of jobs on a model as structs: of a check (residuals, detected changes, estimates of drifts), of joint zeros
+that were reset, of a refinement and of a relocalization.
 """
 
 from __future__ import annotations
@@ -96,3 +96,55 @@ class ZeroReset(msgspec.Struct, frozen=True):
     sigmas_after: float
     message: str
     model: str = ""
+
+
+class RefinementReport(msgspec.Struct, frozen=True):
+    """Result of a refinement of model ``base_epoch`` by ``poses`` (their number).
+
+    ``before_px``, ``after_px``: rms distance, per coordinate, of the pixels from the prediction of the model in use,
+    and of one refined by the other poses. ``score``: improvement in standard deviations; ``limit``: required score.
+    ``step_chi2``: chi-square of the step from the calibrated model, below ``step_limit``. ``predicted_before_px``,
+    ``predicted_after_px``: rms deviation, per coordinate, of predicted pixels at the poses by the model's covariance.
+    """
+
+    base_epoch: int
+    poses: int
+    before_px: float
+    after_px: float
+    score: float
+    limit: float
+    step_chi2: float
+    step_limit: float
+    predicted_before_px: float
+    predicted_after_px: float
+
+    @property
+    def message(self) -> str:
+        """The result as text."""
+        return (
+            f"refined from epoch {self.base_epoch} by {self.poses} rest poses: at poses held out, predictions are "
+            f"{self.after_px:.3g} px rms off instead of {self.before_px:.3g} "
+            f"({self.score:.1f} deviations of chance, {self.limit:.1f} needed); by covariance the deviation of a "
+            f"predicted pixel falls from {self.predicted_before_px:.2g} to {self.predicted_after_px:.2g} px; "
+            f"chi-square of the step {self.step_chi2:.0f} of {self.step_limit:.0f} allowed"
+        )
+
+
+class RelocalizationReport(msgspec.Struct, frozen=True):
+    """Result of a relocalization. ``cameras``: names and descriptions of the motions; ``predicted_px``: largest
+    standard deviation of a predicted pixel over the range of the joints.
+    """
+
+    epoch: int
+    model: str
+    cameras: dict[str, str]
+    chi2: float
+    degrees_of_freedom: int
+    predicted_px: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def message(self) -> str:
+        """The result as text."""
+        described = "; ".join([*self.cameras.values(), *self.notes])
+        return f"model epoch {self.epoch}: {described}; predictions are good to {self.predicted_px:.2g} px"

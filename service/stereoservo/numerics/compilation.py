@@ -7,6 +7,7 @@ from __future__ import annotations
 import atexit
 import functools
 import os
+import resource
 import sys
 import time
 import warnings
@@ -147,13 +148,13 @@ _make_passes_once()
 
 class _CompileLog(event.Listener):  # type: ignore[misc]
     """Appends to ``path``: process, kernel, argument types, and CPU seconds of this thread, without those of the
-    kernels compiled within; at the end of the process its total CPU seconds.
+    kernels compiled within; at the end of the process its total CPU seconds and its largest resident memory [MB].
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
         self._running: list[tuple[float, list[float]]] = []
-        atexit.register(lambda: self._append({"cpu_s": time.process_time()}))
+        atexit.register(self._end)
 
     def on_start(self, event: Any) -> None:
         self._running.append((time.thread_time(), []))
@@ -172,6 +173,10 @@ class _CompileLog(event.Listener):  # type: ignore[misc]
                 "seconds": seconds - sum(inner),
             }
         )
+
+    def _end(self) -> None:
+        peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
+        self._append({"cpu_s": time.process_time(), "peak_mb": round(peak, 1)})
 
     def _append(self, line: dict[str, Any]) -> None:
         import json  # imported only here: a servo process does not need it

@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, IndexType, Writer
 from stereoservo.core.cycle import encode
 from stereoservo.core.settings import CoreSettings
 from stereoservo.recording.compression import Checkpoints, StepBlocks
-from stereoservo.recording.step_records import Fingerprint, RecordedCheckpoint, RecordedStep
+from stereoservo.recording.step_messages import Fingerprint, RecordedCheckpoint, RecordedStep
 
 FORMAT = "stereoservo-flight-2"
 FORMATS = ("stereoservo-flight-1", FORMAT)

@@ -30,7 +30,8 @@ from stereoservo.messages.goals import IncidenceTarget, JointTarget, RunGoal
 from stereoservo.recording.compression import LARGEST, Checkpoints, StepBlocks
 from stereoservo.recording.flight_recorder import FORMATS
 from stereoservo.recording.step_layout import StepRecord, decode_step, outputs_crc
-from stereoservo.recording.step_records import Fingerprint, comparable, fingerprint
+from stereoservo.recording.step_messages import Fingerprint
+from stereoservo.recording.step_records import comparable, fingerprint
 
 LARGEST_RECORD = LARGEST
 """Largest record that a recorder writes [bytes]: a larger stated size is damage, and is not allocated."""

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import msgspec
 
 from stereoservo.recording.flight_recorder import CHUNK_BYTES, FlightRecorder
-from stereoservo.recording.step_records import RecordedCheckpoint, RecordedStep, RecordingStart, StepMessage
+from stereoservo.recording.step_messages import RecordedCheckpoint, RecordedStep, RecordingStart, StepMessage
 
 SEGMENT_S = 60.0
 SEGMENTS = 16

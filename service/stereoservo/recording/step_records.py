@@ -8,7 +8,6 @@ import platform
 import zlib
 from collections.abc import Container
 from functools import cache
-from typing import Protocol
 
 import msgspec
 import numba
@@ -21,19 +20,7 @@ from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state_encoding import encode_state
 from stereoservo.recording.step_layout import encode_step
-
-
-class Fingerprint(msgspec.Struct, frozen=True):
-    """Versions and platform on which bit-for-bit replay depends."""
-
-    stereoservo: str
-    python: str
-    numpy: str
-    numba: str
-    processor: str
-    libc: str
-    laws: dict[str, str] = {}
-    """Version and source hash of every installed law; empty in recordings made before it was stored."""
+from stereoservo.recording.step_messages import Fingerprint, RecordedCheckpoint, RecordedStep, RecordingStart, StepSink
 
 
 @cache
@@ -73,41 +60,6 @@ def _processor() -> str:
 CHECKPOINT_EVERY_S = 5.0
 RETRY_S = 0.1
 """Interval [s] after a checkpoint that the recorder could not take: encoding one takes time for the whole state."""
-
-
-class RecordingStart(msgspec.Struct, frozen=True, tag="start", array_like=True, eq=False):
-    """First message to a recorder."""
-
-    settings: CoreSettings
-    fingerprint: Fingerprint
-
-
-class RecordedStep(msgspec.Struct, frozen=True, tag="step", array_like=True):
-    """One encoded step record. ``lost``: steps dropped just before it because the recorder did not keep up."""
-
-    t_ns: int
-    data: bytes
-    lost: int = 0
-
-
-class RecordedCheckpoint(msgspec.Struct, frozen=True, tag="checkpoint", array_like=True):
-    """The encoded state before step ``step``."""
-
-    t_ns: int
-    step: int
-    state: bytes
-    lost: int = 0
-
-
-StepMessage = RecordingStart | RecordedStep | RecordedCheckpoint
-
-
-class StepSink(Protocol):
-    """Protocol of one connected recorder."""
-
-    def send(self, message: StepMessage) -> bool:
-        """Pass a message on; returns False if the recorder cannot take it now."""
-        ...
 
 
 class StepStream:

@@ -24,7 +24,7 @@ from stereoservo.recording.compression import StepBlocks
 from stereoservo.recording.flight_recorder import CHUNK_S
 from stereoservo.recording.replay import replay
 from stereoservo.recording.step_layout import StepRecord, encode_step
-from stereoservo.recording.step_records import RecordedStep
+from stereoservo.recording.step_messages import RecordedStep
 from stereoservo_sim.benchmarks.timing import summary
 from stereoservo_sim.cells import demo_cell_path
 from stereoservo_sim.progress import ProgressCall

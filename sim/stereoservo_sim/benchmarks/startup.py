@@ -1,5 +1,5 @@
-"""``bench startup``: a cell's first start with an empty cache of compiled kernels beside its second one, the kernels
-compiled in each process, and the base cost of commands.
+"""``bench startup``: a cell's first start with an empty cache of compiled kernels beside its second one, from ``run``
+to the first goal reached; memory of its processes, the kernels compiled in each, and the base cost of commands.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import tempfile
 import time
 import uuid
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,9 @@ COMMANDS = (
     ("warmup", "--help"), ("demo", "--help"), ("simulate", "--help"),
 )  # fmt: skip
 COMPILED_S = 900.0
+LEARNT_S = 900.0
+ASIDE = 0.1
+"""Way of the first joint [rad] from which the first goal returns."""
 
 
 def wait_compiled(client: Client) -> StateMessage:
@@ -78,12 +82,15 @@ def run_startup(repetitions: int, seed: int, progress: ProgressCall) -> dict[str
     }
 
 
-def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
-    """Wall and CPU seconds of a start.
+def _start(folder: Path, name: str, seed: int) -> dict[str, Any]:
+    """Wall and CPU seconds of a start, and memory.
 
     Wall seconds from the start of ``stereoservo run`` until clients are answered, until the arm makes trial motions,
-    and until all kernels are loaded. CPU seconds of the preparation of the start, of background compilation, and of the
-    others until the trial motions. ``overruns``: late cycles, including those due to a kernel that was loaded at rest.
+    until all kernels are loaded, until it rests with a model, and until the first goal, set-points taught there, is
+    reached. CPU seconds of the preparation of the start, of background compilation, and of the others until the trial
+    motions. ``memory_mb``: of each process after the goal, resident and (``pss``) with its share of what others use,
+    too. ``peak_mb``: largest resident memory of preparation and compilation. ``overruns``: late cycles, including those
+    due to a kernel that was loaded at rest.
     """
     began = time.monotonic()
     text, log = folder / f"{name}.txt", folder / f"{name}.log"
@@ -99,17 +106,23 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
                 client.request("calibrate", client.keys.command("calibrate", client.operator), command)
                 client.wait_state(lambda state: state.source == "calibrate", "trial motions", 10.0)
                 calibrating = time.monotonic()
-                pids = {daemon.process.pid, *processes_of(cell_directories(info.cell).runtime).values()}
-                others = sum(_cpu_of(pid) for pid in pids)
-                client.disable()
-                state = wait_compiled(client)
-            compiled = time.monotonic()
+                others = sum(_cpu_of(pid) for role, pid in _processes(daemon.process.pid, info.cell))
+                wait_compiled(client)
+                compiled = time.monotonic()
+                state = client.wait_state(
+                    lambda state: state.model == "valid" and state.source == "hold", "at rest with a model", LEARNT_S
+                )
+                learnt = time.monotonic()
+                first_goal(client)
+                reached = time.monotonic()
+                memory = {role: memory_of(pid) for role, pid in sorted(_processes(daemon.process.pid, info.cell))}
             code = daemon.stop()
     except (ClientError, DaemonError) as error:
         raise ExperimentError("startup", f"the {name} start: {error}; {text.read_text()[-2000:]}") from error
     if code != 0:
         raise ExperimentError("startup", f"the daemon ended with exit code {code}: {text.read_text()[-2000:]}")
-    cpu = {line["process"]: line["cpu_s"] for line in _lines(log) if "cpu_s" in line}
+    ended = {line["process"]: line for line in _lines(log) if "cpu_s" in line}
+    cpu = {process: line["cpu_s"] for process, line in ended.items()}
     spent = {
         "preparation_cpu_s": cpu["cell_preparation"],
         "compilation_cpu_s": cpu["kernel_compilation"],
@@ -119,11 +132,37 @@ def _start(folder: Path, name: str, seed: int) -> dict[str, float]:
         "ready_s": ready - began,
         "calibrating_s": calibrating - began,
         "compiled_s": compiled - began,
+        "learnt_s": learnt - began,
+        "first_goal_s": reached - began,
         **spent,
         "cpu_s": sum(spent.values()),
+        "peak_mb": {name: ended[name]["peak_mb"] for name in ("cell_preparation", "kernel_compilation")},
+        "memory_mb": memory,
         "cycles": state.loop.cycles,
         "overruns": state.loop.overruns,
     }
+
+
+def first_goal(client: Client) -> None:
+    """Teach the set-points seen now, move the first joint aside, and return to them. Raises ClientError."""
+    client.teach("startup")
+    joint, position = next(iter(client.joints().items()))
+    client.goal({joint: position + ASIDE}).reached()
+    client.goal("startup").reached()
+
+
+def _processes(daemon: int, cell: str) -> Iterator[tuple[str, int]]:
+    """Role and id of each live process of a cell, those that compile aside."""
+    yield "supervisor", daemon
+    found = processes_of(cell_directories(cell).runtime)
+    yield from ((role, pid) for role, pid in found.items() if role != "kernel_compilation")
+
+
+def memory_of(pid: int) -> dict[str, float]:
+    """Memory of a process [MB]: resident, and with its share of what other processes use, too."""
+    lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
+    kilobytes = {key: float(value.split()[0]) for key, _, value in (line.partition(":") for line in lines[1:])}
+    return {name.lower(): round(kilobytes[name] / 1024.0, 1) for name in ("Rss", "Pss")}
 
 
 def _cpu_of(pid: int) -> float:

@@ -1,6 +1,8 @@
 """`stereoservo bench`: figures that are there and hang together. How large they are is nobody's promise here."""
 
 import json
+import mmap
+import os
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo_sim.benchmarks import calibration, cycle
 from stereoservo_sim.benchmarks.calibration import run_calibration, thesis_sized
 from stereoservo_sim.benchmarks.features import run_features
+from stereoservo_sim.benchmarks.startup import memory_of
 from stereoservo_sim.benchmarks.timing import machine, stolen_share, summary, timed
 from stereoservo_sim.experiments.learnt_postures import family
 from stereoservo_sim.world import synthetic
@@ -41,6 +44,15 @@ def test_machine_facts_and_stolen_time():
     assert stolen_share((10, 1000), (30, 1200)) == pytest.approx(0.1)
     assert stolen_share(None, (1, 2)) is None
     assert stolen_share((1, 2), (1, 2)) is None
+
+
+def test_memory_of_a_process_is_what_it_has_written():
+    before = memory_of(os.getpid())
+    with mmap.mmap(-1, 64 << 20) as mapped:
+        mapped.write(bytes(64 << 20))
+        after = memory_of(os.getpid())
+    assert all(after[key] - before[key] > 63.0 for key in ("rss", "pss"))
+    assert 0.0 < before["pss"] <= before["rss"]
 
 
 def test_calibration_is_thesis_sized_and_reaches_one_minimum(monkeypatch):

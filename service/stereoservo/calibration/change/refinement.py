@@ -33,7 +33,7 @@ from stereoservo.calibration.rig_model import (
     rig_at,
 )
 from stereoservo.calibration.static_points import with_static_points
-from stereoservo.calibration.trial_data import CalibrationError, StaticObservations, TrialData
+from stereoservo.calibration.trial_data import LEAST_POSES, CalibrationError, StaticObservations, TrialData
 from stereoservo.geometry.distortion import distort
 from stereoservo.kinematics.covariance import (
     NoCovarianceError,
@@ -42,11 +42,11 @@ from stereoservo.kinematics.covariance import (
     pixel_covariances,
 )
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.check_report import RefinementReport
 from stereoservo.numerics.arrays import FloatArray
 
 CHANCE = 0.001
 """Probability with which each test fails although nothing is wrong, or passes although nothing is better."""
-LEAST_POSES = 16
 FOLDS = 4
 """Number of cross-validation folds: each is held out of an estimate, which is then evaluated on it."""
 LEAST_KNOWLEDGE = 0.01
@@ -54,38 +54,6 @@ LEAST_KNOWLEDGE = 0.01
 EVALUATIONS = 40
 SETTLED = 1e-3
 """Last step [sigmas of the prior] at which the estimate has converged."""
-
-
-class RefinementReport(msgspec.Struct, frozen=True):
-    """Result of a refinement of model ``base_epoch`` by ``poses`` (their number).
-
-    ``before_px``, ``after_px``: rms distance, per coordinate, of the pixels from the prediction of the model in use,
-    and of one refined by the other poses. ``score``: improvement in standard deviations; ``limit``: required score.
-    ``step_chi2``: chi-square of the step from the calibrated model, below ``step_limit``. ``predicted_before_px``,
-    ``predicted_after_px``: rms deviation, per coordinate, of predicted pixels at the poses by the model's covariance.
-    """
-
-    base_epoch: int
-    poses: int
-    before_px: float
-    after_px: float
-    score: float
-    limit: float
-    step_chi2: float
-    step_limit: float
-    predicted_before_px: float
-    predicted_after_px: float
-
-    @property
-    def message(self) -> str:
-        """The result as text."""
-        return (
-            f"refined from epoch {self.base_epoch} by {self.poses} rest poses: at poses held out, predictions are "
-            f"{self.after_px:.3g} px rms off instead of {self.before_px:.3g} "
-            f"({self.score:.1f} deviations of chance, {self.limit:.1f} needed); by covariance the deviation of a "
-            f"predicted pixel falls from {self.predicted_before_px:.2g} to {self.predicted_after_px:.2g} px; "
-            f"chi-square of the step {self.step_chi2:.0f} of {self.step_limit:.0f} allowed"
-        )
 
 
 def refine_model(

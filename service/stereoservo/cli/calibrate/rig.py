@@ -29,7 +29,8 @@ from stereoservo.cli.calibrate.command import CalibrateOptions
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
 from stereoservo.cli.output import CommandError, log, shipped_or_path
 from stereoservo.daemon.camera_setup import recorded_camera, video_of
-from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
+from stereoservo.daemon.cell_preparation import make_plan
+from stereoservo.daemon.ipc_messages import PlanOptions
 from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.directories import cell_directories, create_directories
 from stereoservo.messages.locks import AlreadyRunningError, holder

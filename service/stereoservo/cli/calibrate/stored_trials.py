@@ -17,15 +17,15 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.single_joint_fit import MIN_STOPS
-from stereoservo.calibration.trial_data import CalibrationError, TrialData
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, report_folder
 from stereoservo.cli.output import CommandError, log
 from stereoservo.core.cycle import Event, PathFrame, PathRecord
 from stereoservo.core.monitor_state import ObservationStatistics
+from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
 from stereoservo.core.settings import CoreSettings, TrialSettings, core_settings
-from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers, too_few_seen
+from stereoservo.core.sources.measure_at_pose import too_few_seen
 from stereoservo.core.sources.sweeps import path_frame
 from stereoservo.daemon.camera_setup import RecordedCamera, recorded_camera, video_of
-from stereoservo.daemon.jobs.fit_job import report_folder
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.gateway.child_jobs import calibration_result
 from stereoservo.gateway.persistence import ModelStore

@@ -18,8 +18,8 @@ from stereoservo.cli.doctor.cameras import examine_cameras
 from stereoservo.cli.doctor.joints import examine_joints, permission
 from stereoservo.cli.output import CommandError, JsonOption, coloured, emit, shipped_or_path
 from stereoservo.client import SessionError
-from stereoservo.daemon.cell_preparation import PlanOptions, make_plan
-from stereoservo.daemon.ipc_messages import RunPlan
+from stereoservo.daemon.cell_preparation import make_plan
+from stereoservo.daemon.ipc_messages import PlanOptions, RunPlan
 from stereoservo.daemon.taught_goals import TaughtFileError, load_taught
 from stereoservo.gateway.persistence import ModelStore
 from stereoservo.gateway.zenoh_config import gateway_config

@@ -29,7 +29,7 @@ from stereoservo.control.marker_groups import FLAT_PX
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at, markers_at
-from stereoservo.core.settings import CoreSettings
+from stereoservo.core.settings import MIN_MARKERS, CoreSettings
 from stereoservo.kinematics.kernels import (
     distort_pixel,
     exp_twist,
@@ -42,8 +42,6 @@ from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
 
-MIN_MARKERS = 3
-"""Number of markers that determine the pose of a free body."""
 RIGID_SHARE = 0.1
 """Largest deviation of goals in points or matrices from a rigid displacement, for their noise, as a fraction of the
 body's extent.
@@ -70,16 +68,6 @@ ARM_DAMPING = 1e-9
 """Damping of these iterations: joints do not move in directions that the markers do not determine."""
 ARM_CONVERGED = 1e-10
 """Step of an iteration [rad or m] at which it has converged."""
-
-
-def fewest_markers(joints: int) -> int:
-    """Least number of markers that a goal has to show. For an arm of fewer than six joints fewer are sufficient,
-    because the goal must be reachable.
-    """
-    return MIN_MARKERS if joints >= RIGID_FREEDOMS else 1
-
-
-RIGID_FREEDOMS = 6
 
 
 def markers_needed(wanted: FloatArray) -> int:

@@ -14,14 +14,7 @@ import numpy as np
 from stereoservo.control.faces import kept_faces
 from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext, no_model
-from stereoservo.core.goals.marker_body import (
-    MAX_GOAL_RESIDUAL_PX,
-    RIGID_FREEDOMS,
-    BodyState,
-    left_by_components,
-    place_now,
-    view_of,
-)
+from stereoservo.core.goals.marker_body import MAX_GOAL_RESIDUAL_PX, BodyState, left_by_components, place_now, view_of
 from stereoservo.core.goals.reported_path import reported_pixels, reported_samples
 from stereoservo.core.goals.resolve import (
     AT_ONCE,
@@ -35,6 +28,7 @@ from stereoservo.core.goals.servoing import law_of, start_servoing
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
 from stereoservo.core.prediction import centre_of, chain_at, markers_at
+from stereoservo.core.settings import RIGID_FREEDOMS
 from stereoservo.core.sources.incidence import start_incidence
 from stereoservo.core.sources.joint_move import joint_goal
 from stereoservo.core.sources.law import choose, goal_error, scene_and_task

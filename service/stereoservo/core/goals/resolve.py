@@ -17,7 +17,6 @@ from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
     LAW_STEPS,
     MAX_GOAL_RESIDUAL_PX,
-    MIN_MARKERS,
     REFINEMENTS,
     BodyState,
     GoalPose,
@@ -26,7 +25,6 @@ from stereoservo.core.goals.marker_body import (
     displacement_by_law,
     enough_in_view,
     enough_shown,
-    fewest_markers,
     in_front,
     keeps_its_shape,
     mirrored,
@@ -38,7 +36,7 @@ from stereoservo.core.goals.marker_body import (
 )
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import chain_at
-from stereoservo.core.settings import CameraSettings, CoreSettings
+from stereoservo.core.settings import FEWEST_MARKERS, MIN_MARKERS, CameraSettings, CoreSettings
 from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
     invert4,
@@ -119,7 +117,7 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
     arrays = place.arrays
     aim.targets, aim.known = _intersected(arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity)
     shown = int((aim.wanted.sum(axis=0) > 0).sum())
-    needed = fewest_markers(len(place.operators))
+    needed = FEWEST_MARKERS[len(place.operators)]
     if shown < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
@@ -249,7 +247,7 @@ def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
 
 def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
     arrays = place.arrays
-    needed = fewest_markers(len(place.operators))
+    needed = FEWEST_MARKERS[len(place.operators)]
     if len(target.points) < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",

@@ -19,15 +19,15 @@ import numpy as np
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.cycle import ModelUpdate, Sample
 from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
-from stereoservo.core.goals.marker_body import MIN_MARKERS, BodyState, place_now
+from stereoservo.core.goals.marker_body import BodyState, place_now
 from stereoservo.core.goals.resolve import aim_at
 from stereoservo.core.model_arrays import ModelArrays, model_arrays, with_unit_height
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
 from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named, present_problem
 from stereoservo.core.move import goal_of
 from stereoservo.core.prediction import joints_at
-from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
+from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
+from stereoservo.core.settings import MIN_MARKERS, CoreSettings
 from stereoservo.core.state import CoreState, IncidenceGoal, LawRun, PoseMeasurement, ServoGoal
 from stereoservo.kinematics.kernels import distort_pixel, project_points, triangulate
 from stereoservo.messages.goals import (

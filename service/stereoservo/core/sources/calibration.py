@@ -20,6 +20,7 @@ import numpy.typing as npt
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import PathFrame, PathRecord, Sample
 from stereoservo.core.monitors.collision import learnt_loads
+from stereoservo.core.rest_averages import marker_rows
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.measure_at_pose import (
     abort,
@@ -29,7 +30,6 @@ from stereoservo.core.sources.measure_at_pose import (
     continue_move,
     enter,
     first_visit,
-    marker_rows,
     markers_lost,
     mean_joints,
     rest,

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from stereoservo.core.context import SourceOutput, StepContext
+from stereoservo.core.cycle import RESET_ZEROS
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.sources.measure_at_pose import (
     abort,
@@ -35,8 +36,6 @@ from stereoservo.numerics.arrays import FloatArray
 
 SHARE = 0.5
 """Fraction of the range to one side of its base in which a joint was driven for the model's calibration."""
-RESET_ZEROS = "reset_zeros"
-"""Name of a ``check_finished`` event after which drifted joint zeros are to be reset."""
 
 
 QUICK_S = 2.0

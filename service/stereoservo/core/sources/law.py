@@ -16,7 +16,7 @@ from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.pd import damped_velocity
 from stereoservo.core.context import SourceOutput, StepContext, Workspace
-from stereoservo.core.goals.marker_body import MIN_MARKERS, RIGID_FREEDOMS, markers_needed
+from stereoservo.core.goals.marker_body import markers_needed
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import (
     Centre,
@@ -28,6 +28,7 @@ from stereoservo.core.prediction import (
     scene_of,
     triangulated,
 )
+from stereoservo.core.settings import MIN_MARKERS, RIGID_FREEDOMS
 from stereoservo.core.sources.progress import (
     GOES_ON,
     OUT_OF_TIME,

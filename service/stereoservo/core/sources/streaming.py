@@ -24,7 +24,6 @@ from stereoservo.control.law_registry import LAWS
 from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.goals.marker_body import (
     MAX_GOAL_RESIDUAL_PX,
-    MIN_MARKERS,
     REFINEMENTS,
     BodyState,
     displacement_basis,
@@ -33,6 +32,7 @@ from stereoservo.core.goals.marker_body import (
 )
 from stereoservo.core.goals.resolve import given_points, of_this_model, raw_set_points
 from stereoservo.core.model_arrays import ModelArrays
+from stereoservo.core.settings import MIN_MARKERS
 from stereoservo.core.state import ServoGoal, Stream
 from stereoservo.kinematics.kernels import transform_points
 from stereoservo.messages.goals import FeatureTarget, PointTarget, UpdateGoal

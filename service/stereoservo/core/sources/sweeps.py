@@ -16,6 +16,7 @@ import numpy as np
 from stereoservo.calibration.sweeps import smoothed_readings, stamp_scatter
 from stereoservo.core.context import SourceOutput, StepContext
 from stereoservo.core.cycle import PathFrame
+from stereoservo.core.rest_averages import marker_rows
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.calibration import (
     BRAKING,
@@ -39,7 +40,6 @@ from stereoservo.core.sources.measure_at_pose import (
     collect_samples,
     enter,
     first_visit,
-    marker_rows,
     markers_lost,
     mean_joints,
     rest,

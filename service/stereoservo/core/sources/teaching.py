@@ -9,7 +9,7 @@ import numpy as np
 from stereoservo.core.context import RefusalError, StepContext, no_model
 from stereoservo.core.monitors.camera_relocalization import refuse_while_moved
 from stereoservo.core.monitors.moving_camera import moving_cameras, refuse_moving
-from stereoservo.core.sources.measure_at_pose import add_observation, averages, measurement_buffers
+from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
 from stereoservo.core.state import TeachingState
 from stereoservo.messages.goals import Request, Teach
 

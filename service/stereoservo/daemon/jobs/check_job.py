@@ -23,8 +23,8 @@ from stereoservo.calibration.change.model_check import (
     make_check_report,
     reset_zeros,
 )
-from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
-from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line, trials_file
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials, trials_file
+from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line
 from stereoservo.kinematics.model import ModelFileError, load_model, save_model
 from stereoservo.messages.check_report import CheckReport, ZeroReset
 from stereoservo.messages.decoding import RecordBoundary

@@ -23,7 +23,7 @@ import numpy as np
 from stereoservo.calibration.calibration_result import CalibrationFit
 from stereoservo.calibration.fit_assessment import Acceptance, assess_failure, assess_fit, depth_spread
 from stereoservo.calibration.self_calibration import fit_model
-from stereoservo.calibration.trial_data import CalibrationError, TrialData, load_trials
+from stereoservo.calibration.trial_data import CalibrationError, TrialData, figures_file, load_trials, report_folder
 from stereoservo.control.marker_groups import with_groups
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.geometry.distortion import LensEstimate
@@ -146,21 +146,6 @@ def main() -> int:
     except OSError as error:
         print_line({"report_error": str(error)})
     return 0 if result is not None else 1
-
-
-def trials_file(model_path: Path, epoch: int) -> Path:
-    """File of the trial data of the calibration with this epoch."""
-    return model_path.with_name(f"trials-{epoch:06d}.npz")
-
-
-def report_folder(model_path: Path) -> Path:
-    """Folder of a model's report; its page is ``index.html``."""
-    return model_path.with_name(f"{model_path.stem}-report")
-
-
-def figures_file(model_path: Path) -> Path:
-    """File of the figures of a model's fit, for programs."""
-    return model_path.with_name(f"{model_path.stem}-report.json")
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereoservo.calibration.static_points import static_markers, static_observations
 from stereoservo.calibration.sweeps import (
     LONGEST_DELAY_S,
     Leg,
@@ -16,10 +15,18 @@ from stereoservo.calibration.sweeps import (
     smoothed_readings,
     sweep_timing,
 )
-from stereoservo.calibration.trial_data import CalibrationError, TrialCamera, TrialData, WayObservations, finite_rows
+from stereoservo.calibration.trial_data import (
+    CalibrationError,
+    TrialCamera,
+    TrialData,
+    WayObservations,
+    finite_rows,
+    static_markers,
+    static_observations,
+)
 from stereoservo.core.cycle import Event, PathFrame
+from stereoservo.core.rest_averages import marker_rows
 from stereoservo.core.settings import CameraSettings, CoreSettings
-from stereoservo.core.sources.measure_at_pose import marker_rows
 from stereoservo.kinematics.model import JointLoads
 from stereoservo.numerics.arrays import FloatArray
 
