@@ -548,7 +548,6 @@ def _onward(
         gripper = [one for joint in branches for one in tree.beyond(joint) if one.moves]
         first = next((one for one in gripper if one.driven), None)
         how = "" if first is None else f"; flange = {first.child!r} makes {first.name!r} a joint of the arm"
-        how = "" if first is None else f"; flange = {first.child!r} makes {first.name!r} a joint of the arm"
         left.tell(
             f"joints {_names(gripper)} are left out of the arm, which ends at {link!r}, where the file branches: they "
             f"stay at rest{how}",
