@@ -11,6 +11,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
+import msgspec
+import numpy as np
 import pytest
 
 from stereoservo.core.cycle import Event, encode
@@ -18,10 +20,12 @@ from stereoservo.daemon.channels.reports import KEPT_REPORTS, Reporter, ReportIn
 from stereoservo.daemon.channels.seqpacket import ChannelServer, PacketChannel
 from stereoservo.daemon.heartbeat import HEARTBEAT_BYTES, HEARTBEAT_LAYOUT
 from stereoservo.daemon.ipc_messages import Received, Report, event_decoder, report_decoder
+from stereoservo.daemon.kernel_compilation import example_model
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot
 from stereoservo.daemon.servo_links import ProcessLinks
 from stereoservo.gateway.persistence import HandledEvents
-from stereoservo.gateway.servo_connection import ServoConnection
+from stereoservo.gateway.servo_connection import MOST_COVARIANCE_BYTES, ServoConnection
+from stereoservo.kinematics.model import ModelCovariance
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.goals import Hold
 from stereoservo.ports.clock import VirtualClock
@@ -349,3 +353,30 @@ def test_what_a_gateway_answers_wrongly_ends_no_sender(tmp_path: Path) -> None:
     reporter.report("camera_back", "two")
     assert [report_decoder.decode(data).message for data in peer.receive()] == ["one", "two"]
     server.close()
+
+
+@pytest.mark.parametrize("within", [True, False])
+def test_a_models_covariance_reaches_the_loop_if_it_is_not_too_large(
+    tmp_path: Path, within: bool, capfd: pytest.CaptureFixture[str]
+) -> None:
+    most = int((MOST_COVARIANCE_BYTES // 8) ** 0.5)
+    size = most if within else most + 1
+    points = (np.random.default_rng(size).normal(size=(size, 4)),)
+    covariance = ModelCovariance((), (), (), points, np.random.default_rng(1).normal(size=(size, size)))
+    model = msgspec.structs.replace(example_model(), covariance=covariance, epoch=5)
+    channel = Requests(tmp_path, 0)
+    try:
+        assert channel.gateway.send_model(model, kept=True)
+        update = channel.servo.receive().model_update
+    finally:
+        channel.close()
+    assert update is not None
+    assert update.kept
+    said = capfd.readouterr().err
+    if within:
+        assert update.model.covariance is not None
+        assert (update.model.covariance.covariance == covariance.covariance).all()
+        assert "covariance" not in said
+    else:
+        assert update.model.covariance is None
+        assert "covariance of model 5" in said

@@ -35,6 +35,8 @@ from stereoservo.recording.step_messages import StepMessage
 
 HEARTBEAT_EVERY_S = 0.05
 RECONNECT_EVERY_S = 0.1
+MOST_COVARIANCE_BYTES = 256 * 1024
+"""Largest covariance that the loop takes, of 181 parameters: a checkpoint of the state takes about 1 µs a kB for it."""
 
 
 class ServoConnection:
@@ -99,14 +101,21 @@ class ServoConnection:
         """Send a model to the core, with the coplanar groups of its markers, which the loop has no time to compute.
         ``reanchored``, ``kept``: see `cycle.ModelUpdate`.
 
-        The covariance, which the loop does not use, is omitted: messages have a maximum size.
+        A covariance beyond `MOST_COVARIANCE_BYTES` is omitted.
         """
-        bare = msgspec.structs.replace(model, covariance=None)
-        if bare.marker_groups is None:  # of an older version; the fit stores them, and the gateway needs no kernel
+        if model.marker_groups is None:  # of an older version; the fit stores them, and the gateway needs no kernel
             from stereoservo.control.marker_groups import with_groups
 
-            bare = with_groups(bare)
-        return self._control is not None and self._control.send(encode(NewModel(bare, reanchored, kept)))
+            model = with_groups(model)
+        size = 0 if model.covariance is None else model.covariance.covariance.nbytes
+        if size > MOST_COVARIANCE_BYTES:
+            write_log(
+                "gateway",
+                f"the covariance of model {model.epoch} has {size // 1024} kB, the loop takes "
+                f"{MOST_COVARIANCE_BYTES // 1024}: that the cameras agree is not tested where goals end",
+            )
+            model = msgspec.structs.replace(model, covariance=None)
+        return self._control is not None and self._control.send(encode(NewModel(model, reanchored, kept)))
 
     def events(self) -> list[Event]:
         """Core events since the last call, in order."""
