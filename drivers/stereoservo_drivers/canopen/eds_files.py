@@ -234,17 +234,12 @@ class _Reader:
 
     def _restore(self, grouped: dict[int, dict[int | str, list[_Section]]]) -> None:
         """Add records for members whose own object is missing, where the file's lists name it."""
-        listed = {
-            number_in(value)
-            for section in self._sections
-            if section.name in _LISTS
-            for key, (value, _) in section.entries.items()
-            if key.isdecimal()
-        } - {None}
+        lists = [section.entries.items() for section in self._sections if section.name in _LISTS]
+        told = {number_in(value) for entries in lists for key, (value, _) in entries if key.isdecimal()}
+        listed = {index for index in told if index is not None}
         described = {index for index, parts in grouped.items() if _WHOLE in parts}
         if lost := sorted(listed - described):
-            number = f"{len(lost)} of {len(listed)} objects"
-            self._odd(0, "", f"{number} that the file's lists name are missing, the first 0x{lost[0]:04X}")
+            self._odd(0, "", f"{len(lost)} of {len(listed)} listed objects are missing, the first 0x{lost[0]:04X}")
         for index in grouped.keys() - described:
             section = next(iter(grouped[index].values()))[0]
             if index in lost and described <= listed:  # otherwise a damaged header may stand for it
@@ -275,9 +270,7 @@ class _Reader:
     def _first_usable(self, sections: list[_Section], header: str, kind: int) -> tuple[int, str]:
         """Object type and text of the first usable one of an object's sections; (0, "") if there is none."""
         for section in sections[1:]:
-            self._odd(
-                section.line, f"[{header}]", f"again, first in line {sections[0].line}: the first good one is used"
-            )
+            self._odd(section.line, f"[{header}]", f"as in line {sections[0].line}: the first good one is used")
         return next((taken for section in sections if (taken := self._taken(section, header, kind))[1]), (0, ""))
 
     def _taken(self, section: _Section, header: str, kind: int) -> tuple[int, str]:
@@ -290,14 +283,11 @@ class _Reader:
         if stated not in (VAR, DOMAIN, ARRAY, RECORD):
             self._odd(section.entries["ObjectType"][1], f"ObjectType={stated}", f"unknown: taken for {kind}")
             stated = kind
-        lines = [
-            f"[{header}]",
-            f"ParameterName={section.get('ParameterName') or f'0x{header}'}",
-            f"ObjectType={stated}",
-        ]
-        lines += [f"{key}={section.get(key)}" for key in _BESIDE if key in section.entries]
-        if not section.get("ParameterName"):
+        name = section.get("ParameterName")
+        if not name:
             self._odd(section.line, f"[{header}]", "without ParameterName: named by its number")
+        lines = [f"[{header}]", f"ParameterName={name or header}", f"ObjectType={stated}"]
+        lines += [f"{key}={section.get(key)}" for key in _BESIDE if key in section.entries]
         compact = stated == ARRAY and "CompactSubObj" in section.entries
         if compact or stated in (VAR, DOMAIN):
             data_type = self._data_type(section, stated)
@@ -315,9 +305,7 @@ class _Reader:
         meant = number_in(self._named.get(f"{told:x}sub1", _Section("", 0)).get("DefaultValue"))
         if meant is not None and 0 < meant <= _LAST_TYPE:
             return meant
-        self._odd(
-            section.entries["DataType"][1], f"DataType={told}", "not of the standard: its data are taken as bytes"
-        )
+        self._odd(section.entries["DataType"][1], f"DataType={told}", "not of the standard: taken for bytes")
         return _BYTES
 
     def _values(self, section: _Section, data_type: int) -> Iterator[str]:

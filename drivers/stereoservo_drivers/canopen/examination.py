@@ -88,9 +88,7 @@ def eds_findings(path: Path) -> Iterator[ExaminationFinding]:
     for line, remarks in by_line[:SHOWN_LINES]:
         yield ExaminationFinding(f"{path.name}:{line}", None, "; ".join(map(str, remarks)))
     if len(by_line) > SHOWN_LINES:
-        yield ExaminationFinding(
-            path.name, None, f"{len(by_line) - SHOWN_LINES} more lines are odd; take the maker's file"
-        )
+        yield ExaminationFinding(path.name, None, f"{len(by_line) - SHOWN_LINES} more lines are odd")
 
 
 def _examine_bus(driver: ExaminedDriver, channel: Channel, cell_dir: Path) -> Iterator[ExaminationFinding]:

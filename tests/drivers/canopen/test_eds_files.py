@@ -78,7 +78,7 @@ def test_a_good_file_has_no_remarks(read: Read) -> None:
         (f"a line of a tool = 5\n{SHIPPED}", 1, "before any section"),
         (with_line("ParameterName=Device type", "ObjectType="), None, None),
         (with_line("ObjectType=0x9", "DataType=0x0007"), 60, "ObjectType of .1000. again: the first, '0x7', is used"),
-        (f"{SHIPPED}\n[1000]\nParameterName=Other\nDataType=0x5\nAccessType=rw\n", 1849, "first in line 57"),
+        (f"{SHIPPED}\n[1000]\nParameterName=Other\nDataType=0x5\nAccessType=rw\n", 1849, "as in line 57"),
         (in_place("[6040]", "[6040"), 1494, "without ']'"),
         (in_place("[6040]", "6040]"), 1494, r"without '\['"),
         (in_place("[6040]", "[ 0x6040 ]  trailing"), 1494, "'trailing': neither a header"),
@@ -135,7 +135,7 @@ def test_one_bad_object_costs_that_one_alone(read: Read) -> None:
 def test_a_missing_header_takes_nothing_else_along(read: Read) -> None:
     found, remarks = read(in_place("[6041]\n", ""))
     assert found == {key: value for key, value in WHOLE.items() if key[0] != 0x6041}
-    assert ["1 of 70 objects" in str(remarks[0]), "0x6041" in str(remarks[0])] == [True, True]
+    assert ["1 of 70 listed objects" in str(remarks[0]), "0x6041" in str(remarks[0])] == [True, True]
     assert "the header of this object is missing" in str(remarks[1])
 
 
@@ -164,7 +164,8 @@ def test_a_cut_file_is_read_up_to_the_cut(read: Read, share: float) -> None:
 
 def test_compact_arrays_and_types_of_the_file_itself(tmp_path: Path) -> None:
     text = (
-        "[DeviceInfo]\n[A0]\nParameterName=Own type\nObjectType=0x5\n[A0sub1]\nParameterName=Type\nDefaultValue=0x0005\n"
+        "[DeviceInfo]\n[A0]\nParameterName=Own type\nObjectType=0x5\n"
+        "[A0sub1]\nParameterName=Type\nDefaultValue=0x0005\n"
         "[2000]\nParameterName=Own\nDataType=0x00A0\nAccessType=ro\n[2001]\nParameterName=Far\nDataType=0x99\nAccessType=ro\n"
         "[1003]\nParameterName=Errors\nObjectType=8\nDataType=7\nAccessType=ro\nCompactSubObj=3\n"
         "[1003Name]\nNrOfEntries=3\n1=First\n2=Second\n3=Third\n[DeviceComissioning]\nNodeID=0x05\nBaudrate=500\n"
