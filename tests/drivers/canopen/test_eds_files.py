@@ -119,6 +119,15 @@ def test_numbers(text: str, number: int | None) -> None:
     assert number_in(text) == number
 
 
+@pytest.mark.parametrize("value", ["0" * 5000, "07" * 5000, "9" * 5000, "0x" + "f" * 5000, "$NODEID", "[", "\x1c;"])
+@pytest.mark.parametrize("key", ["ObjectType", "DataType", "PDOMapping", "DefaultValue", "VendorNumber"])
+def test_absurd_values_cost_at_most_their_object(read: Read, key: str, value: str) -> None:
+    at = SHIPPED.index(f"\n{key}=")
+    found = read(f"{SHIPPED[:at]}\n{key}={value}{SHIPPED[SHIPPED.index(chr(10), at + 1) :]}")[0]
+    assert {index for index, _ in WHOLE} - {index for index, _ in found} <= {0x1000}
+    assert {index for index, _ in found} <= {index for index, _ in WHOLE}
+
+
 @pytest.mark.parametrize("data_type", ["07", "7h", "0x 0007", '"0x0007"', "0x0007;unsigned", "0x0007  ; unsigned"])
 def test_forms_of_a_data_type(read: Read, data_type: str) -> None:
     assert read(in_place("DataType=0x0007", f"DataType={data_type}"))[0] == WHOLE
