@@ -240,6 +240,9 @@ class _Reader:
         described = {index for index, parts in grouped.items() if _WHOLE in parts}
         if lost := sorted(listed - described):
             self._odd(0, "", f"{len(lost)} of {len(listed)} listed objects are missing, the first 0x{lost[0]:04X}")
+        if listed and (beside := sorted(described - listed)):
+            among = f"{len(beside)} of {len(described)} objects are in none of the file's lists"
+            self._odd(0, "", f"{among}, the first 0x{beside[0]:04X}: taken all the same")
         for index in grouped.keys() - described:
             section = next(iter(grouped[index].values()))[0]
             if index in lost and described <= listed:  # otherwise a damaged header may stand for it

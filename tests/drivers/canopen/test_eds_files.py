@@ -198,7 +198,8 @@ def test_makers_files_give_what_they_gave(name: str) -> None:
     assert objects(found) == objects(former)
     of, was = found.device_information, former.device_information
     assert (of.vendor_number, of.product_number) == (was.vendor_number, was.product_number)
-    assert remarks == []
+    unlisted = "2 of 89 objects are in none of the file's lists, the first 0x606A: taken all the same"
+    assert [str(remark) for remark in remarks] == [unlisted] * (name == "erb415")
 
 
 @pytest.mark.parametrize(
@@ -217,16 +218,18 @@ def test_reported_files(case: str) -> None:
 
 
 @pytest.mark.parametrize(("path", "count"), [(SHIPPED_EDS, 60), (SMALL, 340)])
-def test_corrupted_files_lose_objects_and_gain_none(tmp_path: Path, path: Path, count: int) -> None:
-    most, damaged, told = len(read_eds(path)[0]), tmp_path / "damaged.eds", 0
+def test_corrupted_files_lose_objects_and_gain_none_untold(tmp_path: Path, path: Path, count: int) -> None:
+    whole, usual = read_eds(path)
+    damaged, told = tmp_path / "damaged.eds", 0
     for data in corrupted_copies(path.read_bytes(), count, 9):
         damaged.write_bytes(data)
         try:
             found, remarks = read_eds(damaged)
         except DriverError:
             continue
-        assert 0 < len(found) <= most
-        told += bool(remarks)
+        assert len(found) > 0
+        assert len(found) <= len(whole) or "in none of the file's lists" in "".join(map(str, remarks))
+        told += remarks != usual
     assert told > count // 2
 
 
