@@ -2,8 +2,9 @@
 adapter.
 
 A line ends with CR; a BEL alone means that the adapter refused. Frames: ``tIIILDD…`` (data, 11 bits), ``TIIIIIIIILDD…``
-(29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits.
-Source: LAWICEL AB, CANUSB manual, "CANUSB ASCII commands".
+(29 bits), ``rIIIL``, ``RIIIIIIIIL`` (remote); an adapter may append a time stamp of four digits [ms].
+Source: LAWICEL AB, CANUSB manual, "CANUSB ASCII commands". Other firmware ends its lines with CR LF or LF, and stamps
+with eight digits [us]: both are read.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from functools import cache
 
 from stereoservo_drivers.can.frames import CanFrame
 
-CR = b"\r"
+CR, LF = b"\r", b"\n"
 BEL = b"\a"
 LONGEST_LINE = 64
-"""Maximum length of a line [bytes]; the longest valid one has 30. Longer data without an end is not a line."""
+"""Maximum length of a line [bytes]; the longest valid one has 34. Longer data without an end is not a line."""
 
 BITRATES = {
     10_000: "S0",
@@ -46,6 +47,7 @@ FLAG_WORDS = (
 
 _ID_DIGITS = {ord("t"): 3, ord("r"): 3, ord("T"): 8, ord("R"): 8}
 _REMOTE = {ord("r"), ord("R")}
+_STAMPS = (0, 4, 8)
 
 
 class LineError(ValueError):
@@ -121,8 +123,9 @@ def _any_frame(line: bytes) -> CanFrame:
     if not 0 <= length <= 8:
         raise LineError(line, f"data length {line[digits + 1 : digits + 2]!r}; valid: 0 to 8")
     end = digits + 2 + (0 if remote else 2 * length)
-    if len(line) not in (end, end + 4):
-        raise LineError(line, f"{len(line)} characters; with length {length}: {end}, or {end + 4} with a stamp")
+    if len(line) - end not in _STAMPS:
+        valid = f"{end}, or {end + 4} or {end + 8} with a stamp"
+        raise LineError(line, f"{len(line)} characters; with length {length}: {valid}")
     try:
         identifier = int.from_bytes(unhexlify(line[1:9] if extended else b"0" + line[1:4]), "big")
         data = unhexlify(line[digits + 2 :])
@@ -161,9 +164,17 @@ class LineSplitter:
 
     def __init__(self) -> None:
         self._rest = b""
+        self._after_cr = False
 
     def feed(self, chunk: bytes) -> list[bytes]:
-        """Lines that ``chunk`` completes, without CR. A BEL ends the preceding line and is a line of its own."""
+        """Lines that ``chunk`` completes, without their ends: CR, LF or CR LF. A BEL ends the preceding line and is a
+        line of its own.
+        """
+        if LF in chunk:
+            after_cr, self._after_cr = self._after_cr, chunk.endswith(CR)
+            chunk = chunk[after_cr and chunk.startswith(LF) :].replace(b"\r\n", CR).replace(LF, CR)
+        elif chunk:
+            self._after_cr = chunk.endswith(CR)
         if BEL in chunk:
             chunk = chunk.replace(BEL, b"\r\a\r")
             lines = (self._rest + chunk).split(CR)

@@ -7,7 +7,6 @@ even the modes are optional. An EDS may be wrong or of another firmware, so the 
 
 from __future__ import annotations
 
-import configparser
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import TYPE_CHECKING, Literal
 
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.cia402 import EMCY_ID, FEEDBACK_OBJECTS, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.eds_files import read_eds
 from stereoservo_drivers.canopen.option_checks import parse_sdo_key
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CommandMode
 from stereoservo_drivers.canopen.units import JointScale
@@ -359,13 +359,5 @@ def eds_path(options: CanOptions, cell_dir: Path) -> Path:
 
 
 def load_eds(path: Path) -> canopen.ObjectDictionary:
-    """Object dictionary of an EDS file. Raises DriverError (``eds``) if it is invalid."""
-    from canopen import import_od  # slow import: only for access to drives
-
-    try:
-        dictionary = import_od(str(path))
-    except (ValueError, KeyError, TypeError, AttributeError, NotImplementedError, OSError, configparser.Error) as error:
-        raise DriverError("eds", f"{path} is not an EDS file of CiA 306: {error}", path=str(path)) from error
-    if not len(dictionary):
-        raise DriverError("eds", f"{path} holds no objects", path=str(path))
-    return dictionary
+    """Object dictionary of an EDS file. Raises DriverError (``eds``) if it holds nothing usable."""
+    return read_eds(path)[0]

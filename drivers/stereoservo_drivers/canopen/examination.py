@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from itertools import groupby
 from pathlib import Path
 from typing import Protocol
 
@@ -18,7 +19,10 @@ from stereoservo_drivers.can.channel import Channel
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen.bus_thread import BusThread
 from stereoservo_drivers.canopen.cia402 import HEARTBEAT_ID, RPDO_IDS, SYNC_ID, Cia402Codec
+from stereoservo_drivers.canopen.cia402_configuration import eds_path
 from stereoservo_drivers.canopen.codec import Bringup, listening
+from stereoservo_drivers.canopen.eds_files import read_eds
+from stereoservo_drivers.canopen.gripper import Gripper
 from stereoservo_drivers.canopen.master import Master
 from stereoservo_drivers.canopen.nodes import examine_nodes, other_bitrate, scan
 from stereoservo_drivers.canopen.odrive import OdriveBringup
@@ -32,6 +36,7 @@ SETTLE_S = 0.4
 MISSED_SHARE = 0.01
 LATE_SHARE = 0.5
 HEARTBEAT_SHARE = 0.6
+SHOWN_LINES = 20
 
 
 class ExaminedDriver(JointDriver, Protocol):
@@ -48,6 +53,10 @@ def examine(driver: ExaminedDriver, cell_dir: Path, may_move: MayMove) -> Iterat
     options = driver.options
     yield load_finding(options)
     try:
+        if isinstance(driver.master.codec, Cia402Codec):
+            own = [eds_path(options, cell_dir), *(Gripper(options, each, cell_dir).eds for each in options.gripper)]
+            for path in dict.fromkeys(own):
+                yield from eds_findings(path)
         try:
             channel = Channel(options)
         except DriverError as error:
@@ -71,6 +80,15 @@ def load_finding(options: CanOptions) -> ExaminationFinding:
         f"{load.share:.0%} in the worst case of bit stuffing, limit {options.max_bus_load:.0%} (max_bus_load); "
         f"{len(options.joint)} joints at {options.rate_hz:g} Hz; this bus carries {load.max_rate_hz:.0f} Hz",
     )
+
+
+def eds_findings(path: Path) -> Iterator[ExaminationFinding]:
+    """What is odd in an EDS, line by line, at most ``SHOWN_LINES``. Raises DriverError (``eds``) if it is unusable."""
+    by_line = [(line, list(them)) for line, them in groupby(read_eds(path)[1], lambda remark: remark.line)]
+    for line, remarks in by_line[:SHOWN_LINES]:
+        yield ExaminationFinding(f"{path.name}:{line}", None, "; ".join(map(str, remarks)))
+    if len(by_line) > SHOWN_LINES:
+        yield ExaminationFinding(path.name, None, f"{len(by_line) - SHOWN_LINES} more lines are odd")
 
 
 def _examine_bus(driver: ExaminedDriver, channel: Channel, cell_dir: Path) -> Iterator[ExaminationFinding]:

@@ -40,7 +40,8 @@ def test_lines_of_the_manual(frame, line):
     assert encode_frame(frame) == line
     assert decode_frame(line[:-1]) == frame
     assert decode_frame(line[:1] + line[1:-1].lower()) == frame
-    assert decode_frame(line[:-1] + b"EA5F") == frame  # with a time stamp
+    assert decode_frame(line[:-1] + b"EA5F") == frame  # with a time stamp [ms]
+    assert decode_frame(line[:-1] + b"0001F2E0") == frame  # [us]
 
 
 @given(data=st.data())
@@ -64,6 +65,28 @@ def test_answers_and_bells_in_any_pieces(data, any_frame):
     splitter = LineSplitter()
     pieces = in_pieces(b"".join(parts), data.draw(st.lists(st.integers(0, 10**6), max_size=8)))
     assert [got for piece in pieces for got in splitter.feed(piece)] == expected
+
+
+@pytest.mark.parametrize("end", [b"\r", b"\n", b"\r\n"])
+@pytest.mark.parametrize("stamp", [b"", b"1F2E", b"0001F2E0"])
+def test_other_line_ends_and_stamps_in_any_pieces(end, stamp):
+    frames = [CanFrame(0x181, b"\xaa\xbb"), CanFrame(0x182), CanFrame(0x12ABCDEF, b"\x10", extended=True)]
+    lines = [encode_frame(frame)[:-1] + stamp for frame in frames]
+    stream = b"".join((lines[0], end, end, b"z", end, BEL, lines[1], end, BEL, lines[2], end, b"V1013", end, end))
+    expected = [lines[0], b"", b"z", BEL, lines[1], BEL, lines[2], b"V1013", b""]
+    assert [decode_frame(line) for line in lines] == frames
+    for cuts in [(a, b) for a in range(len(stream) + 1) for b in range(a, len(stream) + 1)]:
+        splitter = LineSplitter()
+        assert [line for piece in in_pieces(stream, [*cuts]) for line in splitter.feed(piece)] == expected
+    splitter = LineSplitter()
+    assert [line for byte in stream for line in splitter.feed(bytes([byte])) + splitter.feed(b"")] == expected
+
+
+def test_mixed_line_ends():
+    for cut in range(12):
+        splitter = LineSplitter()
+        lines = splitter.feed(b"t0800\r\n\n\r\r\n"[:cut]) + splitter.feed(b"t0800\r\n\n\r\r\n"[cut:])
+        assert lines == [b"t0800", b"", b"", b""]
 
 
 @given(data=st.data())
@@ -90,7 +113,7 @@ def test_messages_that_are_no_classical_frames():
         (b"t1239", "data length b'9'"),
         (b"t123z", "data length b'z'"),
         (b"t1232AA", "with length 2: 9"),
-        (b"t1231AABB0", "with length 1: 7, or 11"),
+        (b"t1231AABB0", "with length 1: 7, or 11 or 15"),
         (b"t1231GG", "hexadecimal"),
         (b"t+1F0", "hexadecimal"),
         (b"t1 30", "hexadecimal"),
@@ -114,7 +137,7 @@ def test_any_bytes_are_a_frame_or_refused(line):
         frame = decode_frame(line)
     except LineError:
         return
-    assert encode_frame(frame)[:-1].lower() in (line.lower(), line[:-4].lower())
+    assert encode_frame(frame)[:-1].lower() in (line.lower(), line[:-4].lower(), line[:-8].lower())
 
 
 @pytest.mark.parametrize(

@@ -389,7 +389,6 @@ def test_an_object_that_neither_eds_nor_standard_know_is_refused(make_bench: Mak
     assert "option sdo" in message
 
 
-@pytest.mark.filterwarnings("ignore:The 'warn' method:DeprecationWarning")  # canopen's
 @pytest.mark.parametrize("text", ["", "no section", "[DeviceInfo]\nVendorNumber=1\n", "[6040]\nObjectType=9\n"])
 def test_a_file_that_is_no_eds_is_refused(make_bench: Make, tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.eds").write_text(text)

@@ -15,8 +15,10 @@ from stereoservo.ports.devices import DriverContext, ExaminationFinding
 from stereoservo_drivers.can.frames import CanFrame
 from stereoservo_drivers.canopen import bus_thread, examination, nodes
 from stereoservo_drivers.canopen import driver as driver_module
+from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS
 from stereoservo_drivers.canopen.driver import CanJointDriver
 from stereoservo_drivers.canopen.examination import (
+    SHOWN_LINES,
     cycles_finding,
     heartbeat_findings,
     latency_finding,
@@ -106,6 +108,25 @@ def test_a_good_bus_has_nothing_to_cure(examine: Examine) -> None:
         assert found[f"{joint} position"].ok is True
         assert found[f"{joint} at rest"].ok is True
         assert "by its own encoder" in found[f"{joint} jog"].message
+
+
+def test_what_is_odd_in_an_eds_is_told_by_line(examine: Examine, tmp_path: Path) -> None:
+    own = tmp_path / "own.eds"
+    text = SHIPPED_EDS.read_text().replace("VendorName=stereoservo", "VendorName=Müller\na remark")
+    own.write_bytes(text.encode("cp1252"))
+    found = examine(OPTIONS | {"eds": str(own)})
+    assert found["own.eds:19"].ok is None
+    assert "code page 1252" in found["own.eds:19"].message
+    assert "'a remark': neither a header nor KEY=VALUE: skipped" in found["own.eds:20"].message
+    assert [f.name for f in found.values() if f.ok is False] == []
+    own.write_text(text.replace("AccessType=", "Access="))
+    found = examine(OPTIONS | {"eds": str(own)}, drives=OPTIONS)
+    assert sum(name.startswith("own.eds:") for name in found) == SHOWN_LINES
+    assert "more lines" in found["own.eds"].message
+    own.write_text("no section")
+    found = examine(OPTIONS | {"eds": str(own)}, drives=OPTIONS)
+    assert found["drives"].ok is False
+    assert "line 1: 'no section'" in found["drives"].message
 
 
 def test_nothing_moves_without_leave(examine: Examine) -> None:

@@ -12,10 +12,10 @@ from enum import IntEnum
 from functools import lru_cache, partial
 from pathlib import Path
 
-import canopen
 from canopen.objectdictionary import ODVariable
 
 from stereoservo_drivers.can.frames import CanFrame
+from stereoservo_drivers.canopen.eds_files import read_eds
 from stereoservo_sim.emulators.nodes.node import NEVER_NS
 
 Value = int | float | bytes
@@ -132,7 +132,7 @@ class Entry:
 def _entry(variable: ODVariable) -> Entry:
     default = variable.default
     if isinstance(default, str):
-        default = default.encode("ascii")
+        default = default.encode("ascii", "replace")
     known = variable.data_type in _INTEGERS or variable.data_type in _REALS
     if default is None:
         default = 0 if known else b""
@@ -143,7 +143,7 @@ def _entry(variable: ODVariable) -> Entry:
 @lru_cache(maxsize=256)
 def _parse(path: str, modified_ns: int, node_id: int) -> dict[tuple[int, int], Entry]:
     entries = {}
-    for index, described in canopen.import_od(path, node_id).items():
+    for index, described in read_eds(Path(path), node_id)[0].items():
         if index in DUMMY_BITS:
             continue
         members = [described] if isinstance(described, ODVariable) else described.subindices.values()
@@ -153,7 +153,7 @@ def _parse(path: str, modified_ns: int, node_id: int) -> dict[tuple[int, int], E
 
 
 class Dictionary:
-    """Values of a node's objects. Raises OSError or configparser.Error for an unreadable EDS."""
+    """Values of a node's objects. Raises DriverError (``eds``) for an unreadable EDS, OSError if it is not there."""
 
     def __init__(self, eds: Path, node_id: int) -> None:
         self.entries = _parse(str(eds), eds.stat().st_mtime_ns, node_id)
