@@ -12,6 +12,7 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo.client.session import SessionError
+from stereoservo.core.cycle import encode
 from stereoservo.daemon.cell_preparation import describe_cell, make_plan
 from stereoservo.daemon.channels.reports import Reporter
 from stereoservo.daemon.ipc_messages import PlanOptions, load_plan, save_plan
@@ -22,6 +23,7 @@ from stereoservo.gateway.zenoh_config import gateway_config
 from stereoservo.messages import addresses
 from stereoservo.messages.addresses import keep_secret, redacted
 from stereoservo.messages.cell_file import CellFileError, check_cell
+from stereoservo.messages.locks import hardware_lock_path
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError
@@ -144,11 +146,18 @@ def test_what_a_foreign_driver_says_is_told_without_secrets(tmp_path, capfd):
 
 
 def test_a_plan_that_is_read_keeps_its_secrets(tmp_path):
+    """No recording and no lock file has them; the plan itself is in the daemon's own directory, which others cannot
+    read.
+    """
     tree = tomllib.loads(shipped_cell_path("hil-video").read_text())
     tree["camera"][0]["options"]["source"] = f"http://reader:{SECRET}-of-the-plan@127.0.0.1:9/left.mjpg"
     cell = check_cell(tree)
     plan = make_plan(shipped_cell_path("hil-video"), tmp_path, tmp_path, PlanOptions("doctor"))
-    save_plan(msgspec.structs.replace(plan, cell=cell))
+    plan = msgspec.structs.replace(plan, cell=cell)
+    save_plan(plan)
+    assert SECRET.encode() not in encode(plan.settings()), "a recording begins with these"
+    options = cell.camera[0].options
+    assert SECRET not in str(hardware_lock_path(tmp_path, "video", options))
     addresses._kept.clear()
     load_plan(tmp_path)
     assert redacted(f"reader:{SECRET}-of-the-plan") == "***"

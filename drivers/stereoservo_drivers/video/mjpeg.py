@@ -35,6 +35,7 @@ CHUNK = 1 << 18
 MOST_READS = 64
 SPOILED_IN_A_ROW = 10
 REDIRECTIONS = 3
+MOST_LINES = 100
 _STATUS = re.compile(rb"(?:HTTP|ICY)[/0-9.]*\s+(\d{3})\b[^\S\r\n]*([^\r\n]*)", re.IGNORECASE)
 
 
@@ -257,7 +258,10 @@ class _Head:
         first = stream.readline(LONGEST_LINE)
         status = _STATUS.match(first)
         self._head = b"HTTP/1.0 %b %b\r\n" % status.groups() if status else first
-        while status and (line := stream.readline(LONGEST_LINE)).strip() and len(self._head) < LONGEST_HEADERS:
+        for _ in range(MOST_LINES if status else 0):
+            line = stream.readline(LONGEST_LINE)
+            if not line.strip():
+                break
             self._head += line if b":" in line or line[:1].isspace() else b""
 
     def makefile(self, _mode: str) -> io.BytesIO:
