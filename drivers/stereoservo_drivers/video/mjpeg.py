@@ -158,7 +158,7 @@ class MjpegSource:
 
     def read(self) -> SourcePicture | None:
         """The newest whole image, waiting for one; None: it was damaged. Raises DriverError."""
-        parts: list[StreamPicture] = []
+        parts: list[PictureData] = []
         assert self._parser is not None
         for _ in range(MOST_READS):
             if parts and not self._readable():
@@ -209,7 +209,7 @@ class MjpegSource:
             return True
         return bool(select.select([connection], [], [], 0)[0])
 
-    def _decoded(self, part: StreamPicture, skipped: int) -> SourcePicture | None:
+    def _decoded(self, part: PictureData, skipped: int) -> SourcePicture | None:
         size = None if part.cut else jpeg_size(part.body)
         image = None
         if size is not None:
@@ -396,7 +396,7 @@ class StreamError(Exception):
 
 
 @dataclass
-class StreamPicture:
+class PictureData:
     """A picture: when its first byte arrived, headers of its part by name in lower case, data; ``cut``: incomplete."""
 
     t_ns: int
@@ -416,7 +416,7 @@ class PictureParser:
         self.begun = self.searched = 0  # pictures, and bytes since the last one
         self._largest = largest
         self._buffer = bytearray()
-        self._picture: StreamPicture | None = None
+        self._picture: PictureData | None = None
         self._delimiter = b""
         self._length: int | None = None
         self._at = 0  # the bytes before it need no second look
@@ -426,13 +426,13 @@ class PictureParser:
         """Headers of the part that is being received."""
         return self._picture.headers if self._picture is not None else headers_in(bytes(self._buffer))[0]
 
-    def feed(self, data: bytes, t_ns: int) -> list[StreamPicture]:
+    def feed(self, data: bytes, t_ns: int) -> list[PictureData]:
         """Parse ``data`` received at ``t_ns``; returns the pictures that it completes, or shows to be cut.
 
         Raises StreamError: ``frame_too_large``, ``not_mjpeg``.
         """
         self._buffer += data
-        found: list[StreamPicture] = []
+        found: list[PictureData] = []
         while True:
             if self._picture is None:
                 if not self._find_picture(len(data), t_ns):
@@ -465,7 +465,7 @@ class PictureParser:
             return False
         headers, self._delimiter = headers_in(bytes(buffer[max(0, begin - LONGEST_HEADERS) : begin]))
         self._length = number_in(headers.get("content-length"))
-        self._picture = StreamPicture(t_ns if len(buffer) - begin <= fresh else self._before_ns, headers)
+        self._picture = PictureData(t_ns if len(buffer) - begin <= fresh else self._before_ns, headers)
         self.begun += 1
         self._drop(begin)
         self._at = 2
