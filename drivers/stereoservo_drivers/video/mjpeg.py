@@ -1,7 +1,7 @@
-"""MJPEG over HTTP: the parts of a ``multipart/x-mixed-replace`` stream, each with the arrival time of its first byte.
+"""MJPEG over HTTP: the JPEG pictures of a stream, each with the arrival time of its first byte.
 
-A custom reader, since it stamps a picture when its first byte arrives, reads the server's number of it, and detects a
-truncated JPEG: decoders behind `cv2.VideoCapture` report neither and invent times.
+A custom reader, since it stamps a picture when its first byte arrives, reads the server's number of it, detects a
+truncated JPEG (decoders behind `cv2.VideoCapture` report neither and invent times), and needs no valid headers.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import http.client
+import io
 import re
 import select
 import socket
@@ -34,6 +35,8 @@ CHUNK = 1 << 18
 MOST_READS = 64
 SPOILED_IN_A_ROW = 10
 REDIRECTIONS = 3
+MOST_LINES = 100
+_STATUS = re.compile(rb"(?:HTTP|ICY)[/0-9.]*\s+(\d{3})\b[^\S\r\n]*([^\r\n]*)", re.IGNORECASE)
 
 
 class MjpegSource:
@@ -48,8 +51,9 @@ class MjpegSource:
         self._clock = clock
         self._server_clock = server_clock
         self._socket: socket.socket | None = None
-        self._response: http.client.HTTPResponse | None = None
-        self._parser: MultipartParser | None = None
+        self._stream: io.BufferedReader | None = None
+        self._told = ""
+        self._parser: PictureParser | None = None
         self._chunked: ChunkedDecoder | None = None
         self._interrupted = False
         self._over = False
@@ -64,7 +68,7 @@ class MjpegSource:
             if response.status not in (301, 302, 303, 307, 308):
                 break
             target = self._sent_on(url, response.getheader("Location", ""))
-            response.close()
+            self.release()
             if target.hostname == url.hostname and not target.username:  # the password belongs to that host
                 target = target._replace(netloc=url.netloc.rpartition("@")[0] + "@" + target.netloc)
             url = target
@@ -72,9 +76,11 @@ class MjpegSource:
             raise self._place.error("http", f"sent on more than {REDIRECTIONS} times; use the last address")
         if self._server_clock is not None and self._handshake_ns is not None:
             self._server_clock.round_trip(self._handshake_ns)
-        self._response = response
-        self._parser = MultipartParser(self._boundary(response))
-        self._chunked = ChunkedDecoder() if self._is_chunked(response) else None
+        self._check_status(response)
+        self._told = response.getheader("Content-Type", "no Content-Type")
+        self._parser = PictureParser()
+        coding = response.getheader("Transfer-Encoding", "").lower()
+        self._chunked = ChunkedDecoder() if "chunked" in coding else None
         if self._socket is not None:
             self._socket.settimeout(self._options.read_timeout_s)
 
@@ -103,7 +109,9 @@ class MjpegSource:
             if self._interrupted:
                 raise self._place.error("closed", "the driver was closed while it connected", retry=True)
             connection.request("GET", _target(url), headers=headers)
-            response = connection.getresponse()
+            self._stream = connection.sock.makefile("rb")
+            response = http.client.HTTPResponse(_Head(self._stream))
+            response.begin()
         except (OSError, http.client.HTTPException, UnicodeError) as error:
             connection.close()
             raise _unreached(self._place, error, self._options.open_timeout_s) from error
@@ -117,12 +125,12 @@ class MjpegSource:
             and not challenge
             and asked.lower().startswith("digest ")
         ):
-            response.close()
+            self.release()
             return self._request(url, asked)
         return response
 
-    def _boundary(self, response: http.client.HTTPResponse) -> str:
-        if response.status != 200:
+    def _check_status(self, response: http.client.HTTPResponse) -> None:
+        if response.status // 100 != 2:
             remedy = {
                 401: "Put user and password into the URL: http://user:password@host/... (a '/' in them is written "
                 "%2F, an '@' %40, a '%' %25)",
@@ -135,35 +143,38 @@ class MjpegSource:
                 retry=response.status >= 500,
                 status=response.status,
             )
-        told = response.headers.get_content_type()
-        boundary = response.headers.get_param("boundary")
-        if told != "multipart/x-mixed-replace" or not isinstance(boundary, str) or not boundary.strip("-"):
-            raise self._place.error(
-                "not_mjpeg",
-                f"sends {response.getheader('Content-Type', 'no Content-Type')!r}; an MJPEG stream is "
-                "'multipart/x-mixed-replace; boundary=...'. Look up the path of the camera's MJPEG stream",
-                content_type=told,
-            )
-        return boundary
 
-    def _is_chunked(self, response: http.client.HTTPResponse) -> bool:
-        coding = response.getheader("Transfer-Encoding", "identity").strip().lower()
-        if coding not in ("identity", "chunked"):
-            raise self._place.error("http", f"sends Transfer-Encoding {coding!r}; chunked is read, and none")
-        return coding == "chunked"
+    def _no_mjpeg(self, what: str) -> DriverError:
+        """Error for a body in which no picture was found. A page or a film is no stream, later either."""
+        assert self._parser is not None
+        part = self._parser.awaited().get("content-type")
+        parts = f", its parts are {part!r}" if part else ""
+        return self._place.error(
+            "not_mjpeg",
+            f"{what}; it sends {self._told!r}{parts}. Look up the path of the camera's MJPEG stream",
+            retry=not self._told.lower().startswith(("text/", "video/", "audio/")),
+            content_type=self._told,
+        )
 
     def read(self) -> SourcePicture | None:
         """The newest whole image, waiting for one; None: it was damaged. Raises DriverError."""
-        parts: list[MultipartPart] = []
+        parts: list[PictureData] = []
         assert self._parser is not None
         for _ in range(MOST_READS):
             if parts and not self._readable():
                 break
             if self._over:
-                raise self._place.error("connection_lost", "the server ended the stream", retry=True)
+                if not self._parser.begun:
+                    raise self._no_mjpeg("its answer ended without a JPEG picture")
+                one = " after one picture: is it the address of a snapshot?" if self._parser.begun == 1 else ""
+                raise self._place.error("connection_lost", f"the server ended the stream{one}", retry=True)
             try:
                 data = self._received()
             except TimeoutError as error:
+                if not self._parser.begun and self._parser.searched:
+                    raise self._no_mjpeg(
+                        f"no JPEG picture came, and then nothing for {self._options.read_timeout_s:g} s"
+                    ) from error
                 raise self._place.error(
                     "silent", f"nothing came for {self._options.read_timeout_s:g} s", retry=True
                 ) from error
@@ -176,18 +187,19 @@ class MjpegSource:
                     data = self._chunked.feed(data)
                     self._over = self._over or self._chunked.ended
                 parts += self._parser.feed(data, t_ns)
-            except MultipartError as error:
-                raise self._place.error(error.code, str(error)) from error
+            except StreamError as error:
+                if error.code == "not_mjpeg":
+                    raise self._no_mjpeg(str(error)) from error
+                raise self._place.error(error.code, str(error), retry=True) from error
             if self._over and parts:
                 break
-        return self._decoded(parts[-1], len(parts) - 1) if parts else None
+        whole = [part for part in parts if not part.cut] or parts[-1:]
+        return self._decoded(whole[-1], len(whole) - 1) if whole else None
 
     def _received(self) -> bytes:
-        """Bytes after the head as received from the connection, with at most one wait; none: its end. Data that
-        `http.client` read with the head come first.
-        """
-        assert self._response is not None
-        return self._response.fp.read1(CHUNK)
+        """Bytes after the head as received from the connection, with at most one wait; none: its end."""
+        assert self._stream is not None
+        return self._stream.read1(CHUNK)
 
     def _readable(self) -> bool:
         connection = self._socket
@@ -197,10 +209,7 @@ class MjpegSource:
             return True
         return bool(select.select([connection], [], [], 0)[0])
 
-    def _decoded(self, part: MultipartPart, skipped: int) -> SourcePicture | None:
-        told = part.headers.get("content-type", "image/jpeg").partition(";")[0].strip().lower()
-        if told not in ("image/jpeg", "image/jpg"):
-            raise self._place.error("not_mjpeg", f"its parts are {told!r}; image/jpeg is read", content_type=told)
+    def _decoded(self, part: PictureData, skipped: int) -> SourcePicture | None:
         size = None if part.cut else jpeg_size(part.body)
         image = None
         if size is not None:
@@ -234,10 +243,30 @@ class MjpegSource:
 
     def release(self) -> None:
         """Close the connection."""
-        if self._response is not None:
-            self._response.close()
+        if self._stream is not None:
+            self._stream.close()
         if self._socket is not None:
             self._socket.close()
+
+
+class _Head:
+    """Head of an answer, as a socket for `http.client`: corrected where browsers accept what that refuses or misreads
+    (another protocol's name, no version or reason, lines without a colon).
+    """
+
+    def __init__(self, stream: io.BufferedReader) -> None:
+        first = stream.readline(LONGEST_LINE)
+        status = _STATUS.match(first)
+        self._head = b"HTTP/1.0 %b %b\r\n" % status.groups() if status else first
+        for _ in range(MOST_LINES if status else 0):
+            line = stream.readline(LONGEST_LINE)
+            if not line.strip():
+                break
+            self._head += line if b":" in line or line[:1].isspace() else b""
+
+    def makefile(self, _mode: str) -> io.BytesIO:
+        """The head alone."""
+        return io.BytesIO(self._head)
 
 
 def _target(url: SplitResult) -> str:
@@ -310,7 +339,7 @@ class ChunkedDecoder:
         self._after_chunk = False
 
     def feed(self, data: bytes) -> bytes:
-        """The payload in ``data``; nothing after the last chunk. Raises MultipartError: ``http``."""
+        """The payload in ``data``; nothing after the last chunk. Raises StreamError: ``http``."""
         payload = bytearray()
         at = 0
         while at < len(data) and not self.ended:
@@ -324,7 +353,7 @@ class ChunkedDecoder:
             end = data.find(b"\n", at)
             self._line += data[at:] if end < 0 else data[at:end]
             if len(self._line) > LONGEST_LINE:
-                raise MultipartError("http", f"a chunk's head is above {LONGEST_LINE} bytes")
+                raise StreamError("http", f"a chunk's head is above {LONGEST_LINE} bytes")
             if end < 0:
                 break
             at = end + 1
@@ -336,27 +365,29 @@ class ChunkedDecoder:
         if self._after_chunk:
             self._after_chunk = False
             if line:
-                raise MultipartError("http", "a chunk does not end where its size says")
+                raise StreamError("http", "a chunk does not end where its size says")
             return
         digits = line.partition(b";")[0].strip()
         if not digits or len(digits) > 16 or digits.strip(b"0123456789abcdefABCDEF"):
-            raise MultipartError("http", f"a chunk's size is {digits[:32]!r}; valid: hexadecimal digits")
+            raise StreamError("http", f"a chunk's size is {digits[:32]!r}; valid: hexadecimal digits")
         self._left = int(digits, 16)
         self.ended = not self._left
 
 
-# -- multipart streams ---------------------------------------------------------------------------------------
-# Incremental parser of a ``multipart/x-mixed-replace`` stream (RFC 2046).
+# -- pictures in a stream ------------------------------------------------------------------------------------
+# Incremental parser: pictures by their JPEG markers (ITU-T T.81, B.1), and the text before each of them.
 
 
-LARGEST_PART = 50_000_000
+LARGEST_PICTURE = 50_000_000
 LONGEST_HEADERS = 16384
-_JPEG_END = b"\xff\xd9"
-_HEADERS_END = re.compile(rb"\A\r?\n|\r?\n\r?\n")
-"""An empty line; the first one if a part has no headers."""
+LONGEST_SEARCH = 1 << 20
+"""Bytes without a picture after which a stream counts as none."""
+_BEGIN, _END = b"\xff\xd8\xff", b"\xff\xd9"
+_MARKER = re.compile(rb"\xff[\xc0-\xcf\xd8-\xef\xfe]")
+"""Markers with a segment, begin and end. Coded data contain none: a 0xFF in them is stuffed, or of a restart."""
 
 
-class MultipartError(Exception):
+class StreamError(Exception):
     """The stream is malformed: ``code`` as of DriverError."""
 
     def __init__(self, code: str, message: str) -> None:
@@ -365,8 +396,8 @@ class MultipartError(Exception):
 
 
 @dataclass
-class MultipartPart:
-    """One part: when its first byte arrived, its headers by name in lower case, its body; ``cut``: incomplete."""
+class PictureData:
+    """A picture: when its first byte arrived, headers of its part by name in lower case, data; ``cut``: incomplete."""
 
     t_ns: int
     headers: dict[str, str] = field(default_factory=dict)
@@ -374,112 +405,111 @@ class MultipartPart:
     cut: bool = False
 
 
-class MultipartParser:
-    """Parses bytes as they arrive into whole parts. Resynchronises after a part of wrong length.
+class PictureParser:
+    """Parses bytes as they arrive into JPEG pictures; constant memory, and no wait beyond a picture's last byte.
 
-    A JPEG picture without a stated length is complete with its end marker: the boundary after it may be sent only with
-    the next picture.
+    A picture ends at its end marker, outside its segments (which can contain a thumbnail); a stated length is used only
+    if a picture ends there. Boundaries, headers and text parts between pictures need not be valid.
     """
 
-    def __init__(self, boundary: str, largest: int = LARGEST_PART) -> None:
-        # Half of the servers include the boundary's leading "--" in the header: both forms give this.
-        self._delimiter = b"--" + boundary.encode("latin-1").lstrip(b"-")
+    def __init__(self, largest: int = LARGEST_PICTURE) -> None:
+        self.begun = self.searched = 0  # pictures, and bytes since the last one
         self._largest = largest
         self._buffer = bytearray()
-        self._part: MultipartPart | None = None
+        self._picture: PictureData | None = None
+        self._delimiter = b""
         self._length: int | None = None
-        self._in_body = False
-        self._scanned = 0
+        self._at = 0  # the bytes before it need no second look
+        self._before_ns = 0
 
-    def feed(self, data: bytes, t_ns: int) -> list[MultipartPart]:
-        """Parse ``data`` received at ``t_ns``; returns the parts that it completes.
+    def awaited(self) -> dict[str, str]:
+        """Headers of the part that is being received."""
+        return self._picture.headers if self._picture is not None else headers_in(bytes(self._buffer))[0]
 
-        Raises MultipartError: ``frame_too_large``, ``not_mjpeg``.
+    def feed(self, data: bytes, t_ns: int) -> list[PictureData]:
+        """Parse ``data`` received at ``t_ns``; returns the pictures that it completes, or shows to be cut.
+
+        Raises StreamError: ``frame_too_large``, ``not_mjpeg``.
         """
         self._buffer += data
-        parts: list[MultipartPart] = []
+        found: list[PictureData] = []
         while True:
-            if self._part is None:
-                if not self._find_part():
-                    return parts
-                self._part = MultipartPart(t_ns)
-            if not self._in_body and not self._read_headers(self._part):
-                return parts
-            if not self._read_body(self._part):
-                return parts
-            parts.append(self._part)
-            self._part = None
+            if self._picture is None:
+                if not self._find_picture(len(data), t_ns):
+                    break
+                continue
+            end, cut = self._find_end()
+            if end < 0:
+                break
+            self._picture.body, self._picture.cut = bytes(self._buffer[:end]), cut
+            found.append(self._picture)
+            self._drop(end)
+            self._picture, self.searched = None, 0
+        self._before_ns = t_ns
+        return found
 
-    def _find_part(self) -> bool:
-        """Skip to after the next boundary's line, and check that something follows."""
-        at = self._buffer.find(self._delimiter, self._scanned)
-        if at < 0:
-            keep = len(self._delimiter) - 1
-            if len(self._buffer) > self._largest:
-                raise MultipartError("not_mjpeg", "its boundary does not come")
-            self._scanned = max(0, len(self._buffer) - keep)
+    def _drop(self, count: int) -> None:
+        del self._buffer[:count]
+        self._at = 0
+
+    def _find_picture(self, fresh: int, t_ns: int) -> bool:
+        """Skip text up to the next picture, and read its headers. ``fresh``: bytes at the end that arrived just now."""
+        buffer = self._buffer
+        begin = buffer.find(_BEGIN, self._at)
+        if begin < 0:
+            self.searched += len(buffer) - self._at
+            if self.searched > LONGEST_SEARCH:
+                raise StreamError("not_mjpeg", f"no JPEG picture in {self.searched} bytes")
+            self._drop(max(0, len(buffer) - LONGEST_HEADERS))
+            self._at = max(0, len(buffer) - len(_BEGIN) + 1)
             return False
-        end = self._buffer.find(b"\n", at)
-        if end < 0 or end + 1 == len(self._buffer):
-            self._scanned = at
-            self._bound_headers(len(self._buffer) - at)
-            return False
-        del self._buffer[: end + 1]
-        self._scanned = 0
+        headers, self._delimiter = headers_in(bytes(buffer[max(0, begin - LONGEST_HEADERS) : begin]))
+        self._length = number_in(headers.get("content-length"))
+        self._picture = PictureData(t_ns if len(buffer) - begin <= fresh else self._before_ns, headers)
+        self.begun += 1
+        self._drop(begin)
+        self._at = 2
         return True
 
-    def _read_headers(self, part: MultipartPart) -> bool:
-        found = _HEADERS_END.search(self._buffer, 0, LONGEST_HEADERS + 4)
-        end, width = (found.start(), len(found[0])) if found else (-1, 0)
-        self._bound_headers(len(self._buffer) if end < 0 else end)
-        if end < 0:
-            return False
-        for line in bytes(self._buffer[:end]).splitlines():
-            name, colon, value = line.decode("latin-1").partition(":")
-            if colon:
-                part.headers[name.strip().lower()] = value.strip()
-        del self._buffer[: end + width]
-        self._length = number_in(part.headers.get("content-length"))
-        if self._length is not None and self._length > self._largest:
-            raise MultipartError(
-                "frame_too_large", f"a picture of {self._length} bytes; at most {self._largest} are taken"
-            )
-        self._in_body = True
-        self._scanned = 0
-        return True
+    def _find_end(self) -> tuple[int, bool]:
+        """Length of the picture at the beginning of the buffer, and whether it is cut; -1: more bytes are needed."""
+        buffer, length = self._buffer, self._length
+        if length is not None and self._at < length <= len(buffer) and buffer[length - 2 : length] == _END:
+            return length, False
+        while (found := _MARKER.search(buffer, self._at)) is not None:
+            at, marker = found.start(), buffer[found.start() + 1]
+            if marker == 0xD9:
+                return at + 2, False
+            if marker == 0xD8:
+                cut = buffer.rfind(self._delimiter, 2, at) if self._delimiter else -1
+                return max(cut, 0) or at, True
+            self._at = at
+            end = at + 2 + int.from_bytes(buffer[at + 2 : at + 4], "big")
+            if self._delimiter and (cut := buffer.find(self._delimiter, at, end)) >= 0:
+                return cut, True
+            if len(buffer) < max(end, at + 4):
+                break
+            self._at = end
+        else:
+            self._at = max(self._at, len(buffer) - 1)
+        if len(buffer) > self._largest:
+            raise StreamError("frame_too_large", f"a picture above {self._largest} bytes without an end")
+        return -1, False
 
-    def _bound_headers(self, length: int) -> None:
-        if length > LONGEST_HEADERS:
-            raise MultipartError("not_mjpeg", f"headers of a part above {LONGEST_HEADERS} bytes")
 
-    def _read_body(self, part: MultipartPart) -> bool:
-        length = self._length
-        boundary = self._buffer.find(b"\n" + self._delimiter, self._scanned)
-        if length is not None and (boundary < 0 or boundary + 1 >= length):
-            if len(self._buffer) < length:
-                self._rescan_from_tail()
-                return False
-            return self._complete(part, length, cut=False)
-        if boundary >= 0:
-            boundary -= self._buffer[:boundary].endswith(b"\r")
-            return self._complete(part, boundary, cut=length is not None)
-        if length is None and self._buffer.endswith((_JPEG_END, _JPEG_END + b"\r\n")) and jpeg_size(self._buffer):
-            return self._complete(part, self._buffer.rindex(_JPEG_END) + 2, cut=False)
-        if len(self._buffer) > self._largest:
-            raise MultipartError("frame_too_large", f"a picture above {self._largest} bytes without an end")
-        self._rescan_from_tail()
-        return False
-
-    def _rescan_from_tail(self) -> None:
-        self._scanned = max(0, len(self._buffer) - len(self._delimiter) - 1)
-
-    def _complete(self, part: MultipartPart, length: int, *, cut: bool) -> bool:
-        part.body = bytes(self._buffer[:length])
-        part.cut = cut
-        del self._buffer[:length]
-        self._in_body = False
-        self._scanned = 0
-        return True
+def headers_in(text: bytes) -> tuple[dict[str, str], bytes]:
+    """Headers by name in lower case in the text before a picture, from its last boundary on, and that boundary with the
+    line end before it (none if there is none).
+    """
+    headers: dict[str, str] = {}
+    delimiter = b""
+    for line in text.splitlines():
+        name, colon, value = line.decode("latin-1").partition(":")
+        if line and (not colon or line.startswith(b"--")):
+            headers, delimiter = {}, b"\n" + line if len(line) > 3 else b""
+        elif colon:
+            headers[name.strip().lower()] = value.strip()
+    return headers, delimiter
 
 
 def number_in(text: str | None) -> int | None:

@@ -17,6 +17,7 @@ from stereoservo.control.law_registry import LawDescription
 from stereoservo.core.cycle import Event, Status, StepInputs, decode_array, encode
 from stereoservo.core.settings import CoreSettings, core_settings
 from stereoservo.kinematics.model import CellModel
+from stereoservo.messages.addresses import keep_secret
 from stereoservo.messages.cell_file import CameraSection, CellFile
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.directories import CellDirectories
@@ -319,7 +320,9 @@ def save_plan(plan: RunPlan) -> None:
 
 
 def load_plan(runtime: Path) -> RunPlan:
-    """Read the plan of a cell from its runtime directory. Raises PlanError."""
+    """Read the plan of a cell from its runtime directory; its secrets are in no error from now on. Raises PlanError."""
     path = plan_path(runtime)
     with decoding(lambda cause: PlanError(path, f"{cause}; this process is started by `stereoservo run`")):
-        return _plan_decoder.decode(read_bounded(path, MAX_PLAN_BYTES))
+        plan = _plan_decoder.decode(read_bounded(path, MAX_PLAN_BYTES))
+    keep_secret(msgspec.to_builtins(plan.cell))
+    return plan

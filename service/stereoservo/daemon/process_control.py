@@ -9,6 +9,8 @@ import sys
 from contextlib import suppress
 from types import FrameType
 
+from stereoservo.messages.addresses import redacted
+
 _PR_SET_PDEATHSIG = 1
 
 
@@ -55,7 +57,7 @@ class Termination:
 def write_log(process: str, message: str) -> None:
     """Write one line to stderr; the journal adds the time. With a full disk or a closed pipe only the line is lost."""
     with suppress(OSError, ValueError):
-        print(f"stereoservo {process}: {message}", file=sys.stderr, flush=True)
+        print(f"stereoservo {process}: {redacted(message)}", file=sys.stderr, flush=True)
 
 
 def child_environment() -> dict[str, str]:

@@ -13,6 +13,8 @@ from urllib.parse import SplitResult, quote, unquote, unquote_to_bytes
 
 HIDDEN = "***"
 """Placeholder for an omitted user, password or token."""
+SHORTEST = 4
+"""Characters of a text that is replaced wherever it stands: shorter ones are parts of words."""
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*)://", re.ASCII)
 _HOST = re.compile(
     r"(?P<host>\[[0-9A-Fa-f:.]+(?:%[A-Za-z0-9._~%-]+)?\]|(?:[A-Za-z0-9._~!$&'()*+,;=-]|%[0-9A-Fa-f]{2})*)"
@@ -120,6 +122,35 @@ def without_secrets(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_secrets(item) for item in value]
     return value
+
+
+_kept: dict[str, str] = {}
+"""Secret texts of this process's cell files and what is shown instead of each."""
+
+
+def keep_secret(value: Any, key: str = "") -> None:
+    """Have :func:`redacted` replace the secrets in ``value``, a cell file or options of drivers, from now on."""
+    if isinstance(value, Mapping):
+        for name, item in value.items():
+            keep_secret(item, str(name))
+    elif isinstance(value, list | tuple):
+        for item in value:
+            keep_secret(item, key)
+    elif isinstance(value, str):
+        if _SECRET_OPTION.search(key) and len(value) >= SHORTEST:
+            _kept[value] = HIDDEN
+        address, user = Address(value), _read(value).userinfo
+        if address != value:
+            _kept[value] = address
+        if user is not None and len(user) >= SHORTEST:
+            _kept[user] = HIDDEN
+
+
+def redacted(text: str) -> str:
+    """``text``, such as a driver's error, without the secrets that the cell files of this process contain."""
+    for secret in sorted((secret for secret in _kept if secret in text), key=len, reverse=True):
+        text = text.replace(secret, _kept[secret])
+    return text
 
 
 class _Reading(NamedTuple):

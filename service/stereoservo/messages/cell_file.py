@@ -13,7 +13,7 @@ import msgspec
 import msgspec.inspect
 from msgspec import Meta
 
-from stereoservo.messages.addresses import without_secrets
+from stereoservo.messages.addresses import keep_secret, redacted, without_secrets
 from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 from stereoservo.messages.known_length import known_length_of
 
@@ -34,7 +34,7 @@ class CellFileError(Exception):
 
     def __init__(self, path: Path | str, key: str, message: str) -> None:
         where = f"{path}: {key}: " if key else f"{path}: "
-        super().__init__(where + message)
+        super().__init__(where + redacted(message))
         self.path = str(path)
         self.key = key
 
@@ -270,7 +270,8 @@ def load_cell_file(path: Path) -> CellFile:
 
 
 def check_cell(tree: dict[str, Any], path: Path | str = "<cell>") -> CellFile:
-    """Decode a parsed cell file strictly. Raises CellFileError."""
+    """Decode a parsed cell file strictly; its secrets are in no message from now on. Raises CellFileError."""
+    keep_secret(tree)
     _check_numbers(tree, "", path)
     if tree.get("schema") != SCHEMA:
         raise CellFileError(path, "schema", f"is {tree.get('schema')!r}; this version reads {SCHEMA}")

@@ -19,6 +19,7 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import msgspec
 
+from stereoservo.messages.addresses import redacted
 from stereoservo.messages.cell_file import Mount
 from stereoservo.messages.goals import AuxiliarySpec
 from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
@@ -28,7 +29,8 @@ Pacing = Literal["clock", "driver", "lockstep"]
 
 
 class DriverError(Exception):
-    """A driver cannot execute a request. The message states the cause, the value and the valid values.
+    """A driver cannot execute a request. The message states the cause, the value and the valid values; secrets of the
+    cell file are not in it, also if the driver quotes them.
 
     Attributes:
         code: short machine-readable cause, e.g. ``"not_configured"``, ``"option"``, ``"connection_lost"``.
@@ -37,9 +39,9 @@ class DriverError(Exception):
     """
 
     def __init__(self, code: str, message: str, *, retry: bool = False, **data: Any) -> None:
-        super().__init__(message)
+        super().__init__(redacted(message))
         self.code = code
-        self.data = data
+        self.data = {key: redacted(value) if isinstance(value, str) else value for key, value in data.items()}
         self.retry = retry
 
 

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
+from stereoservo.messages.addresses import redacted
+
 JOINT_DRIVERS = "stereoservo.joint_drivers"
 CAMERA_DRIVERS = "stereoservo.camera_drivers"
 DETECTORS = "stereoservo.detectors"
@@ -49,9 +51,9 @@ class PluginError(Exception):
     """A plug-in is unknown or does not import. ``known`` lists the names of its group."""
 
     def __init__(self, group: str, name: str, message: str, known: tuple[str, ...]) -> None:
-        super().__init__(message)
+        super().__init__(redacted(message))
         self.group = group
-        self.name = name
+        self.name = redacted(name)
         self.known = known
 
 

@@ -11,6 +11,7 @@ from stereoservo.core.cycle import encode
 from stereoservo.daemon.channels.seqpacket import ChannelError, ChannelServer, Outbox, PacketChannel
 from stereoservo.daemon.ipc_messages import Received, Report, received_decoder, report_decoder
 from stereoservo.daemon.process_control import write_log
+from stereoservo.messages.addresses import redacted
 from stereoservo.messages.decoding import RecordBoundary
 from stereoservo.messages.recording_request import RecordedImages
 from stereoservo.ports.devices import Clock
@@ -42,7 +43,7 @@ class Reporter:
     def _add(self, kind: str, message: str, images: RecordedImages | None = None) -> None:
         self._number += 1
         now_ns = self._clock.now_ns()
-        report = Report(self._origin, kind, message, now_ns, images, self._stream, self._number)
+        report = Report(self._origin, kind, redacted(message), now_ns, images, self._stream, self._number)
         self._outbox.add(self._number, encode(report))
 
     def flush(self) -> None:
