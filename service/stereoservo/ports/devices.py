@@ -41,7 +41,9 @@ class DriverError(Exception):
     def __init__(self, code: str, message: str, *, retry: bool = False, **data: Any) -> None:
         super().__init__(redacted(message))
         self.code = code
-        self.data = {key: redacted(value) if isinstance(value, str) else value for key, value in data.items()}
+        self.data: dict[str, Any] = {
+            key: redacted(value) if isinstance(value, str) else value for key, value in data.items()
+        }
         self.retry = retry
 
 
