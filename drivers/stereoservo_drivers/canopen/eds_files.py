@@ -72,7 +72,7 @@ def clean_eds(raw: bytes) -> tuple[str, list[EdsRemark]]:
     """Text of the usable objects of a file's bytes, as strict readers take it (empty: there are none), and what is odd,
     by line.
     """
-    reader = _Reader(raw)
+    reader = _EdsReader(raw)
     objects = reader.objects()
     text = "".join((*reader.device(), *objects)) if objects else ""
     return text, sorted(reader.remarks, key=lambda remark: remark.line)
@@ -135,7 +135,7 @@ class _Section:
         return self.entries.get(key, ("",))[0]
 
 
-class _Reader:
+class _EdsReader:
     """Reads one file; ``remarks`` collects what is odd."""
 
     def __init__(self, raw: bytes) -> None:
