@@ -92,7 +92,16 @@ _DEVICE_NUMBERS = ("VendorNumber", "ProductNumber", "RevisionNumber")
 _DUMMIES = tuple(f"Dummy{k:04d}" for k in range(1, 8))
 _VALUES = ("LowLimit", "HighLimit", "DefaultValue", "ParameterValue")
 _BESIDE = ("StorageLocation", "Factor", "Description", "Unit")
-_OTHERS = "ParameterName ObjectType DataType AccessType PDOMapping CompactSubObj NrOfEntries NodeID".split()
+_OTHERS = [
+    "ParameterName",
+    "ObjectType",
+    "DataType",
+    "AccessType",
+    "PDOMapping",
+    "CompactSubObj",
+    "NrOfEntries",
+    "NodeID",
+]
 _KEYS = {key.lower(): key for key in (*_OTHERS, *_VALUES, *_BESIDE, *_DEVICE_TEXTS, *_DEVICE_NUMBERS, *_DUMMIES)}
 """Keys that are read, as strict readers spell them."""
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
