@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-from stereoservo.cli.calibrate.command import _lines, _telling
+from stereoservo.cli.calibrate.command import TRIALS_SHARE, _telling
 from stereoservo.cli.dispatch import COMMANDS, OTHERS, OWN, app, example_of, grouped
-from stereoservo.cli.output import cells_beginning, coloured
+from stereoservo.cli.output import cells_beginning, coloured, log
 from stereoservo.messages.directories import state_root
+from stereoservo.messages.learning import tenths
 from stereoservo.messages.wire import EventMessage
 from stereoservo.ports import plugins
 from stereoservo_sim.progress import LINE_EVERY_S, progress_lines
@@ -90,12 +91,12 @@ def test_colour_is_for_terminals(monkeypatch):
 
 
 def test_calibration_tells_its_progress_in_lines_without_a_terminal(capsys):
-    progress = _telling("mycell", _lines("calibrating"))
+    progress = _telling("mycell", tenths(log, "calibrating:"))
     for share in (0.0, 0.01, 0.5, 0.51, 1.0):
         progress(EventMessage(1, "boot", 0, 0.0, "calibration", message="joint j1", progress=share))
     lines = capsys.readouterr().err.splitlines()
-    assert 2 < len(lines) < 5
-    assert lines[0] == "calibrating: 0 %: joint j1"
+    reached = [int(10 * share * TRIALS_SHARE) for share in (0.5, 1.0)]
+    assert lines == [f"calibrating: {10 * tenth} %: joint j1" for tenth in reached]
     progress(EventMessage(2, "boot", 0, 0.0, "held", message="held by ann"))
     assert capsys.readouterr().err == "held by ann: nothing moves until `stereoservo resume mycell`\n"
 

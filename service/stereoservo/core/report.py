@@ -121,6 +121,8 @@ def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
         found.append(planning_reason(state.planning))
     if context.inputs.compiling:
         found.append(Reason("COMPILING", "info", hint=COMPILING))
+    if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
+        found.append(state.comparison.reason)
     if state.stopped:
         if state.stop_reason is not None:
             found.append(state.stop_reason)
@@ -129,8 +131,6 @@ def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
         found.append(Reason("HELD", "hold", hint="resume to go on"))
     if state.readiness == ModelReadiness.SUSPECT:
         found.append(Reason("MODEL_SUSPECT", "hold", hint="calibrate again"))
-    if state.readiness == ModelReadiness.UNCONFIRMED and state.comparison is not None:
-        found.append(state.comparison.reason)
     return tuple(found)
 
 
