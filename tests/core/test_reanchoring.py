@@ -14,7 +14,8 @@ from stereoservo.core.cycle import ModelUpdate
 from stereoservo.core.servo_core import ServoCore
 from stereoservo.core.state import PoseMeasurement
 from stereoservo.core.state_encoding import decode_state, encode_state
-from stereoservo.daemon.jobs.rest_poses import RelocalizationPoses, relocalize_from_events
+from stereoservo.daemon.jobs.relocalization_job import relocalize_from_events
+from stereoservo.daemon.jobs.rest_poses import RelocalizationPoses
 from stereoservo.kinematics.model import ShutterOffset
 from stereoservo.messages.goals import (
     Calibrate,

@@ -251,6 +251,8 @@ def test_what_cannot_be_written_keeps_its_bytes_is_reported_and_ends_nothing(
         cameras.on_core_event(adjusted, fresh=True)
         assert not teaching.taught(msgspec.structs.replace(taught_event(5), name="place"))
         calibration.on_core_event(Event(6, 6, "calibration_finished", id="g"), fresh=True)
+        while calibration.busy:
+            calibration.poll()
         record_run(partial(end_run, directories, "a cause"))
         log.add("goal_accepted", id="two")
     events = log.since(1).events[told:]
@@ -291,7 +293,6 @@ def test_a_journal_on_a_full_disk_counts_what_it_loses_and_goes_on(
     space[0] = 1000
     journal.add(b'{"line": 5}')
     journal.close()
-    assert path.read_bytes() == b'{"line": 0}\n{"line": 1}\n\n{"line": 5}\n'.replace(b"1}\n\n", b"1}\n") or True
     whole = [line for line in path.read_bytes().splitlines() if line.endswith(b"}")]
     assert whole[0] == b'{"line": 0}'
     assert whole[-1] == b'{"line": 5}'

@@ -43,6 +43,8 @@ def test_trial_motions_without_a_stop_fail_with_their_code(tmp_path: Path) -> No
     link = cast(ServoConnection, object())  # nothing is given to the core: there is no model
     calibration = CalibrationJobs(example_settings(), ModelStore(tmp_path), link, log, tmp_path / "checks.jsonl")
     calibration.on_core_event(Event(1, 1, "calibration_finished", id="g"), fresh=True)
+    while calibration.busy:
+        calibration.poll()
     (told,) = log.since(1).events
     assert (told.kind, told.name) == ("calibration_failed", "too_few_stops")
     assert FailedError("calibration", told).code == "too_few_stops"

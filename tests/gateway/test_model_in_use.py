@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from itertools import permutations
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,7 +11,9 @@ from typing import Any
 import msgspec
 import pytest
 
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import Event
+from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.daemon.kernel_compilation import example_settings
 from stereoservo.gateway.calibration_jobs import CalibrationJobs
 from stereoservo.gateway.model_updates import RelocalizationJobs
@@ -63,6 +66,31 @@ def test_a_model_that_another_has_overtaken_is_no_longer_waited_for(tmp_path: Pa
     assert (told.kind, told.id) == ("calibration_failed", "g")
     assert "epoch 6" in told.message
     assert not jobs.busy
+
+
+def test_the_gateway_goes_on_while_trial_data_are_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sweeps are reduced for longer than the gateway may be silent."""
+    begun, may_end = threading.Event(), threading.Event()
+
+    def slow(collector: TrialCollector) -> TrialData:
+        begun.set()
+        assert may_end.wait(60.0)
+        raise CalibrationError("too_few_stops", "made at last")
+
+    monkeypatch.setattr(TrialCollector, "trials", slow)
+    log = EventLog("boot", lambda _: None)
+    jobs = CalibrationJobs(example_settings(), ModelStore(tmp_path), LINK, log, tmp_path / "checks.jsonl")
+    jobs.on_core_event(Event(1, 1, "calibration_finished", id="g"), fresh=True)
+    assert begun.wait(60.0)
+    jobs.poll()
+    assert jobs.busy
+    assert not log.since(1).events
+    may_end.set()
+    while jobs.busy:
+        jobs.poll()
+    (failed,) = log.since(1).events
+    assert (failed.kind, failed.id, failed.message) == ("calibration_failed", "g", "made at last")
+    jobs.close()
 
 
 @pytest.mark.parametrize("order", orders(4, 5, AGREES))

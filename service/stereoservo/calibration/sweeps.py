@@ -52,7 +52,6 @@ TAKEN_UP = 0.0, 2e-3, 5e-3, 1e-2, 2e-2
 """Travels of a joint [rad or m] after which its play may be taken up; frames before that are left out of the timing."""
 NO_BETTER = 1.02
 """Ratio of residual variances below which the shorter travel is used."""
-LONGEST_READOUT_S = 0.2
 MEDIAN = 0.4549
 """Median of chi-square with one degree of freedom."""
 FEWEST_JUDGED, LEAST_SHARE = 5, 0.2
@@ -300,7 +299,7 @@ def _track(along: FloatArray, pixels: FloatArray, seen: BoolArray, terms: int) -
         limit = FAR_SIGMAS**2 * max(float(np.median(squares)) / np.log(2.0), 1e-12)  # chi² of two coordinates
         wrong = squares > limit
         if not wrong.any() or freedom <= LEAST_FREEDOM:
-            slopes = _slopes(columns, pixels[used], count, along[used], low, high)
+            slopes = _slopes((inverse @ pixels[used])[:count], along[used], low, high)
             return _Track(count, low, high, used, inverse, left, slopes, freedom)
         used[np.flatnonzero(used)[wrong]] = False
 
@@ -400,14 +399,12 @@ def _timing_equation(legs: list[Leg], camera: int, values: FloatArray, travel: f
         return nothing
     joint = legs[0].trial
     readings = [leg.positions_at(t) for leg, t in zip(legs, times, strict=True)]
-    begin = np.concatenate([np.full(len(t), leg.ends[0, joint]) for leg, t in zip(legs, times, strict=True)])
-    ahead = np.concatenate(
-        [np.full(len(t), np.sign(np.diff(leg.ends[:, joint]))) for leg, t in zip(legs, times, strict=True)]
-    )
+    starts, ends = np.repeat([leg.ends[:, joint] for leg in legs], [len(t) for t in times], axis=0).T
+    ahead = np.sign(ends - starts)
     speed = np.concatenate([_rates(leg, t)[:, joint] for leg, t in zip(legs, times, strict=True)])
     positions, pixels = np.concatenate(readings), np.concatenate([leg.pixels[camera] for leg in legs])
     links, aside = positions[:, joint] - 0.5 * play * ahead, _others(np.delete(positions, joint, axis=1))
-    taken_up = np.abs(positions[:, joint] - begin) >= max(travel, abs(play))
+    taken_up = np.abs(positions[:, joint] - starts) >= max(travel, abs(play))
     low, high = float(links.min()), float(links.max())
     square, across, squares, freedom = nothing
     seen = finite_rows(pixels) & taken_up[:, None]
@@ -417,17 +414,17 @@ def _timing_equation(legs: list[Leg], camera: int, values: FloatArray, travel: f
             continue
         mine = (seen == mask[:, None]).all(axis=0)
         columns = np.column_stack([_columns(links[mask], low, high, terms), aside[mask]])
-        basis, _ = np.linalg.qr(columns)
+        inverse = np.linalg.pinv(columns)
         rows = np.repeat(pixels[mask][:, mine, 1] - 0.5 * legs[0].heights[camera], 2, axis=1)
         tracks = pixels[mask][:, mine].reshape(int(mask.sum()), -1)
-        slopes = _slopes(columns, tracks, terms, links[mask], low, high) * speed[mask, None]
+        slopes = _slopes((inverse @ tracks)[:terms], links[mask], low, high) * speed[mask, None]
         tracks -= slopes * rows * row_s
-        coefficients, *_ = np.linalg.lstsq(columns, tracks, rcond=None)
+        coefficients = inverse @ tracks
         left = tracks - columns @ coefficients
-        by_link = _slopes(columns, tracks, terms, links[mask], low, high)
+        by_link = _slopes(coefficients[:terms], links[mask], low, high)
         slopes = by_link * speed[mask, None]
         effects = np.array([slopes, slopes * rows, by_link * (-0.5 * ahead[mask, None])])
-        effects -= basis @ (basis.T @ effects)
+        effects -= columns @ (inverse @ effects)
         square = square + np.einsum("ifk,jfk->ij", effects, effects)
         across = across + np.einsum("ifk,fk->i", effects, left)
         squares += float((left * left).sum())
@@ -435,13 +432,10 @@ def _timing_equation(legs: list[Leg], camera: int, values: FloatArray, travel: f
     return _Equation(square, across, squares, freedom)
 
 
-def _slopes(
-    columns: FloatArray, tracks: FloatArray, terms: int, links: FloatArray, low: float, high: float
-) -> FloatArray:
-    """Derivatives (f, k) of the polynomials that describe ``tracks`` (f, k), by the position ``links`` (f,)."""
-    coefficients, *_ = np.linalg.lstsq(columns, tracks, rcond=None)
-    derivative = np.polynomial.chebyshev.chebder(coefficients[:terms])
-    return np.asarray(_columns(links, low, high, max(terms - 1, 1)) @ derivative * (2.0 / max(high - low, 1e-12)))
+def _slopes(coefficients: FloatArray, links: FloatArray, low: float, high: float) -> FloatArray:
+    """Derivatives (f, k) of polynomials of ``coefficients`` (terms, k), by the position ``links`` (f,)."""
+    derivative = np.polynomial.chebyshev.chebder(coefficients)
+    return np.asarray(_columns(links, low, high, len(derivative)) @ derivative * (2.0 / max(high - low, 1e-12)))
 
 
 def _at_one_time(pixels: FloatArray, along: FloatArray, speed: FloatArray, row_s: float, height: int) -> FloatArray:
@@ -458,7 +452,8 @@ def _at_one_time(pixels: FloatArray, along: FloatArray, speed: FloatArray, row_s
             continue
         low, high = float(along[seen].min()), float(along[seen].max())
         terms = min(DELAY_TERMS, int(seen.sum()) // 3)
-        slopes = _slopes(_columns(along[seen], low, high, terms), pixels[seen, marker], terms, along[seen], low, high)
+        coefficients = np.linalg.pinv(_columns(along[seen], low, high, terms)) @ pixels[seen, marker]
+        slopes = _slopes(coefficients, along[seen], low, high)
         late = row_s * (pixels[seen, marker, 1] - 0.5 * height)
         found[seen, marker] -= slopes * (speed[seen] * late)[:, None]
     return found

@@ -99,7 +99,7 @@ class PreviewEncoder:
 
     def _work(self) -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), NICENESS)  # Linux: for this thread only
-        told = False
+        warned = False
         while True:
             with self._ready:
                 while self._waiting is None and not self._ended:
@@ -115,9 +115,9 @@ class PreviewEncoder:
                 )
                 self._slot.write(_encoder.encode(picture))
             except Exception as error:  # an image that cannot be encoded must not stop the camera
-                if not told:
+                if not warned:
                     write_log(f"vision-{self._camera}", f"no preview of a picture: {cause_of(error)}")
-                told = True
+                warned = True
 
     def close(self) -> None:
         """End the thread and release the slots. Idempotent."""

@@ -320,13 +320,13 @@ def prepare(
             stderr=errors,
             env=child_environment(),
         )
-        told = ProgressLines()
+        progress = ProgressLines()
         while process.poll() is None:
             if termination.asked:
                 process.kill()
                 process.wait()
                 return None
-            told.look(directories.runtime)
+            progress.look(directories.runtime)
             time.sleep(0.02)
         errors.seek(0)
         text = errors.read().decode(errors="replace").strip()
@@ -366,21 +366,21 @@ def restore(plan: RunPlan) -> list[str]:
     Otherwise a damaged file would end every new child at its start, forever.
     """
     directories = plan.directories
-    told = []
+    messages = []
     try:
         try:
             load_plan(directories.runtime)
         except PlanError as error:
             save_plan(plan)
-            told.append(f"the run plan was damaged and is written again: {error}")
+            messages.append(f"the run plan was damaged and is written again: {error}")
         if repair_stop_slot(directories.stop_slot):
-            told.append(f"{directories.stop_slot}: was damaged and is marked again as the stop slot")
+            messages.append(f"{directories.stop_slot}: was damaged and is marked again as the stop slot")
         for path, capacity, layout in _slots(plan):
             if create_slot(path, capacity, layout):
-                told.append(f"{path}: was damaged and is laid out again")
+                messages.append(f"{path}: was damaged and is laid out again")
     except OSError as error:
-        told.append(f"{directories.runtime}: cannot be put in order: {error}")
-    return told
+        messages.append(f"{directories.runtime}: cannot be put in order: {error}")
+    return messages
 
 
 def record_run(write: Callable[[], None]) -> None:

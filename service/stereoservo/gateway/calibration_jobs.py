@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO
@@ -15,7 +16,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.fit_assessment import assess_failure
-from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import RESET_ZEROS, TRIALS_BEGIN, Event
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.ipc_messages import store_event
@@ -54,6 +55,8 @@ class CalibrationJobs:
         self._known_length = known_length
         self._job = TrialCollector(settings)
         self.learning = LearningProgress(settings, runtime)
+        self._worker = ThreadPoolExecutor(max_workers=1)
+        self._reduction: tuple[TrialCollector, Future[TrialData]] | None = None
         self._fit: FitJob | None = None
         self._fit_id = ""
         self._reported = False
@@ -66,7 +69,7 @@ class CalibrationJobs:
     @property
     def busy(self) -> bool:
         """Whether a new model is being computed, or waits to be used."""
-        return self._fit is not None or self._check is not None or self._handed is not None
+        return any(one is not None for one in (self._reduction, self._fit, self._check, self._handed))
 
     def load(self, core_epoch: int) -> None:
         """Send the newest fitting model on disk to the core, unless the core (epoch ``core_epoch``) already has it."""
@@ -87,7 +90,7 @@ class CalibrationJobs:
         self._job.add(event)
         self.learning.on_event(event, fresh=fresh)
         if event.kind == "calibration_finished" and fresh:
-            self._start_fit()
+            self._start_fit(event.id)
         elif event.kind == "check_finished" and fresh:
             self._start_check(reset=event.name == RESET_ZEROS)
         elif event.kind == "warning" and event.message.startswith("model refused"):
@@ -120,21 +123,27 @@ class CalibrationJobs:
             origin="gateway",
         )
 
-    def _start_fit(self) -> None:
+    def _start_fit(self, goal_id: str) -> None:
+        """Reduce what was collected to trial data, in a thread: it takes longer than the gateway may be silent."""
         self.cancel()
-        self._fit_id, self._reported = self._job.id, False
+        self._fit_id, self._reported = goal_id, False
+        collected, self._job = self._job, TrialCollector(self._settings)
+        self._reduction = collected, self._worker.submit(collected.trials)
+
+    def _fit_to(self, collected: TrialCollector, trials: Future[TrialData]) -> None:
+        self._reduction = None
         try:
             epoch = self._models.next_epoch()
-            self._fit = FitJob(self._job.trials(), self._models.path(epoch), epoch, self._known_length)
+            self._fit = FitJob(trials.result(), self._models.path(epoch), epoch, self._known_length)
         except (CalibrationError, OSError) as error:
             self._failed(self._fit_id, str(error), getattr(error, "code", ""))
             return
-        message = f"{self._job.frames} frames of sweeps" if self._job.frames else f"{self._job.stops} stops"
-        if self._job.standing:
-            markers = ", ".join(str(marker) for marker in self._job.standing)
+        message = f"{collected.frames} frames of sweeps" if collected.frames else f"{collected.stops} stops"
+        if collected.standing:
+            markers = ", ".join(str(marker) for marker in collected.standing)
             message += f"; markers {markers} stood still: they are not of the body, and left out"
-        if self._job.strayed:
-            markers = ", ".join(str(marker) for marker in self._job.strayed)
+        if collected.strayed:
+            markers = ", ".join(str(marker) for marker in collected.strayed)
             message += (
                 f"; markers {markers} are static by the cell file's [scene], but moved in the images: they are left "
                 "out of the scene. Are they on the arm, did something push them?"
@@ -166,6 +175,8 @@ class CalibrationJobs:
 
     def poll(self) -> None:
         """Report the progress of a running fit or check, and handle its result."""
+        if self._reduction is not None and self._reduction[1].done():
+            self._fit_to(*self._reduction)
         if self._fit is not None:
             self._poll_fit(self._fit)
         if self._check is not None:
@@ -259,11 +270,12 @@ class CalibrationJobs:
         for job in (self._fit, self._check):
             if job is not None:
                 job.close()
-        self._fit = self._check = None
+        self._reduction = self._fit = self._check = None
 
     def close(self) -> None:
         """Cancel all jobs. Idempotent."""
         self.cancel()
+        self._worker.shutdown(wait=False)
         self.learning.end()
 
 

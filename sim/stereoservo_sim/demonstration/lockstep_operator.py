@@ -14,7 +14,8 @@ from stereoservo.calibration.change.model_check import (
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData
 from stereoservo.core.cycle import Event, ModelUpdate
-from stereoservo.daemon.jobs.rest_poses import RelocalizationPoses, relocalize_from_events
+from stereoservo.daemon.jobs.relocalization_job import relocalize_from_events
+from stereoservo.daemon.jobs.rest_poses import RelocalizationPoses
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
 from stereoservo.daemon.lockstep import LockstepCell
 from stereoservo.daemon.taught_goals import feature_target

@@ -324,8 +324,9 @@ def _next(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) ->
     n = sweeps.lowest.size
     if sweeps.leg >= 0 and sweeps.joint < n:
         _judge_stamps(sweeps, context)
-        for camera in np.flatnonzero(_scattered(sweeps.stamp_sums, len(context.settings.marker_ids))):
-            return _stop_instead(sweeps, context, int(camera))
+        scattered = _scattered(sweeps.stamp_sums, len(context.settings.marker_ids))
+        if scattered.any():
+            return _stop_instead(sweeps, context, int(scattered.argmax()))
     if sweeps.outward and sweeps.joint < n:
         return _begin(sweeps, context, settings.base.copy(), outward=False)
     while sweeps.joint < n:

@@ -14,10 +14,12 @@ from pathlib import Path
 
 import msgspec
 
+from stereoservo.calibration.relocalized_model import RelocalizedModel, RestObservations, RestPose, relocalize
 from stereoservo.calibration.trial_data import CalibrationError
+from stereoservo.core.cycle import Event
 from stereoservo.daemon.jobs.fit_job import child_arguments, error_line, print_line
-from stereoservo.daemon.jobs.rest_poses import load_events, relocalize_from_events
-from stereoservo.kinematics.model import load_model, save_model
+from stereoservo.daemon.jobs.rest_poses import load_events
+from stereoservo.kinematics.model import CellModel, load_model, save_model
 from stereoservo.messages.check_report import RelocalizationReport
 from stereoservo.messages.decoding import DamagedError
 
@@ -49,6 +51,18 @@ def main() -> int:
     )
     print_line({"reanchored": msgspec.to_builtins(report)})
     return 0
+
+
+def relocalize_from_events(events: list[Event], model: CellModel, epoch: int, created: str = "") -> RelocalizedModel:
+    """Relocalized model of ``epoch``; the newest of ``events`` names the cameras that moved.
+
+    Raises CalibrationError.
+    """
+    newest = events[-1]
+    poses = tuple(RestPose(event.joints, event.samples) for event in events if event.joints is not None)
+    return relocalize(
+        model, RestObservations(poses), newest.cameras, rigid_rig=newest.rigid, epoch=epoch, created=created
+    )
 
 
 if __name__ == "__main__":

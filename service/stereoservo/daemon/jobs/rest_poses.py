@@ -1,12 +1,11 @@
-"""Observations at rest that the gateway collects for the refinement and relocalization jobs, the file that passes them,
-and what the latter makes of them.
+"""Observations at rest that the gateway collects for the refinement and relocalization jobs, and the file that passes
+them.
 """
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -17,14 +16,10 @@ from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
 from stereoservo.core.settings import CoreSettings
 from stereoservo.daemon.jobs.trial_collection import TrialCollector
-from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.decoding import DamagedError, decoding
 from stereoservo.messages.files import read_bounded, write_atomically
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
-
-if TYPE_CHECKING:
-    from stereoservo.calibration.relocalized_model import RelocalizedModel
 
 MOST_POSES = 128
 APART = 0.02
@@ -154,18 +149,3 @@ def load_events(path: Path) -> list[Event]:
     with decoding(partial(DamagedError, path)):
         data = read_bounded(path, MAX_EVENTS_BYTES)
         return msgspec.msgpack.decode(data, type=list[Event], dec_hook=decode_array)
-
-
-def relocalize_from_events(events: list[Event], model: CellModel, epoch: int, created: str = "") -> RelocalizedModel:
-    """Relocalized model of ``epoch``; the newest of ``events`` names the cameras that moved.
-
-    Raises CalibrationError.
-    """
-    # Here: the gateway, which collects the events, needs no scipy.
-    from stereoservo.calibration.relocalized_model import RestObservations, RestPose, relocalize
-
-    newest = events[-1]
-    poses = tuple(RestPose(event.joints, event.samples) for event in events if event.joints is not None)
-    return relocalize(
-        model, RestObservations(poses), newest.cameras, rigid_rig=newest.rigid, epoch=epoch, created=created
-    )
