@@ -2,14 +2,14 @@
 
 RPDO1: control word (0x6040) and set-point, a velocity (0x60FF) or a position (0x607A, 0x60C1), type 255, so that a stop
 needs no SYNC. TPDO1: status word (0x6041) and position (0x6064); TPDO2, TPDO3: the other feedback; all with every SYNC.
-COB-IDs of the predefined connection set (CiA 301).
+Drives with smaller PDOs spread this over several (`pdo_plan`). COB-IDs of the predefined connection set (CiA 301).
 """
 
 from __future__ import annotations
 
 import math
-import struct
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 
@@ -32,6 +32,19 @@ from stereoservo_drivers.canopen.cia402_words import (
 )
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC, AxisFault, Feedback
 from stereoservo_drivers.canopen.options import POSITION_MODES, CanJoint, CanOptions, CommandMode
+from stereoservo_drivers.canopen.pdo_plan import (
+    CONTROL_WORD,
+    FEEDBACK_OBJECTS,
+    POSITION,
+    RPDO_IDS,
+    STATUS_WORD,
+    TARGETS,
+    TPDO_IDS,
+    Pdo,
+    PdoPlan,
+    data_layout,
+    planned,
+)
 from stereoservo_drivers.canopen.units import JointScale, Unwrapper, wrap_int32
 from stereoservo_drivers.position_output import PositionOutput
 
@@ -39,21 +52,7 @@ SYNC_ID = 0x080
 EMCY_ID = 0x080
 HEARTBEAT_ID = 0x700
 SDO_REQUEST_ID, SDO_RESPONSE_ID = 0x600, 0x580
-RPDO_IDS = (0x200, 0x300, 0x400, 0x500)
-TPDO_IDS = (0x180, 0x280, 0x380, 0x480)
 
-FEEDBACK_OBJECTS: dict[str, tuple[int, str]] = {
-    "velocity": (0x606C0020, "i"),
-    "effort": (0x60770010, "h"),
-    "following_error": (0x60F40020, "i"),
-    "switches": (0x60FD0020, "I"),
-}
-"""Feedback -> (mapping entry: index, sub-index, bits; struct format)."""
-
-STATUS_AND_POSITION = (0x60410010, 0x60640020)
-_COMMAND = struct.Struct("<Hi")
-_STATUS_AND_POSITION = struct.Struct("<Hi")
-_ENABLE_OPERATION = int(ControlWord.ENABLE_OPERATION)
 INTERPOLATE = 0x0010
 """Control word bit with which a drive in interpolated position mode follows its set-points."""
 BIT_S = 0.1
@@ -63,29 +62,29 @@ FOLLOWED_SHARE = 0.5
 LEAST_TRAVEL = 8.0
 """[counts] Least commanded travel that is compared with the joint's travel."""
 ENABLING = frozenset(ENABLE_STEPS.values())
-_PDO_BYTES = 8
 _CODES_KEPT = 4
+_NOTHING: Mapping[int, bytes] = {}
 _PERMILLE = 1e-3
 
 
-def tpdo_feedback(feedback: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
-    """Content of TPDO2, TPDO3, …: ``feedback`` in its order, as many as fit into 8 bytes each."""
-    pdos: list[tuple[str, ...]] = []
-    free = 0
-    for what in feedback:
-        size = struct.calcsize("<" + FEEDBACK_OBJECTS[what][1])
-        if size > free:
-            pdos.append(())
-            free = _PDO_BYTES
-        pdos[-1] = (*pdos[-1], what)
-        free -= size
-    return tuple(pdos)
+class CommandPdo:
+    """An RPDO with control word, set-point, or both; ``held``: its other bytes, which do not change."""
 
+    def __init__(self, pdo: Pdo, node_id: int, target: int, held: bytes) -> None:
+        self._id = RPDO_IDS[pdo.number] + node_id
+        self._held = held.ljust(pdo.size, b"\0")
+        ends = np.cumsum([(entry & 0xFF) // 8 for entry in pdo.mapping]).tolist()
+        spans = {entry: slice(end - (entry & 0xFF) // 8, end) for entry, end in zip(pdo.mapping, ends, strict=True)}
+        self._word, self._target = spans.get(CONTROL_WORD), spans.get(target)
 
-def tpdo_mappings(feedback: tuple[str, ...]) -> tuple[tuple[int, ...], ...]:
-    """Mapping entries of TPDO1, TPDO2, …"""
-    further = (tuple(FEEDBACK_OBJECTS[what][0] for what in pdo) for pdo in tpdo_feedback(feedback))
-    return (STATUS_AND_POSITION, *further)
+    def frame(self, word: int, target: int) -> CanFrame:
+        """The frame with a control word and a set-point."""
+        data = bytearray(self._held)
+        if self._word is not None:
+            data[self._word] = word.to_bytes(2, "little")
+        if self._target is not None:
+            data[self._target] = target.to_bytes(4, "little", signed=True)
+        return CanFrame(self._id, bytes(data))
 
 
 class DriveAxis:
@@ -93,7 +92,7 @@ class DriveAxis:
 
     ``enabled``, ``faulty``: from ``state``. ``heard_poll``: number of the poll before its last heartbeat.
     ``limit_side``: 1 or -1 if the drive's internal limit is known to be on that side of the joint, else 0.
-    ``switches``: 0x60FD, if it is sent. ``mode``, ``guarded``: as configured.
+    ``switches``: 0x60FD, if it is sent. ``mode``, ``guarded``, ``commands``: as configured.
     """
 
     def __init__(self, index: int, joint: CanJoint) -> None:
@@ -101,7 +100,6 @@ class DriveAxis:
         self.joint = joint
         self.node_id = joint.node_id
         self.name = f"node {joint.node_id} ({joint.name})"
-        self.command_id = RPDO_IDS[0] + joint.node_id
         self.scale = JointScale.of(joint)
         self.counts = Unwrapper()
         self.effort_unit = joint.direction * _PERMILLE * (joint.rated_torque or 1.0)
@@ -116,6 +114,7 @@ class DriveAxis:
         self.switches: int | None = None
         self.mode: CommandMode = "csv"
         self.guarded = False
+        self.commands: list[CommandPdo] = []
         self._limited_s, self._limited_from, self._asked = 0.0, 0.0, 0.0
         self._followed, self._ignored_s = False, 0.0
 
@@ -134,6 +133,10 @@ class DriveAxis:
         """Side of the joint (1, -1) with an active limit switch; 0: none, both, or unknown."""
         switches = self.switches or 0
         return self.joint.direction * ((switches >> 1 & 1) - (switches & 1))
+
+    def frames(self, word: int, target: int) -> list[CanFrame]:
+        """Frames with a control word and a set-point."""
+        return [pdo.frame(word, target) for pdo in self.commands]
 
     def held_at_limit(self, position: float, period_s: float) -> bool:
         """Whether the drive has limited its motion long enough, and either a limit switch is possible or the joint
@@ -174,6 +177,15 @@ class DriveAxis:
         self._ignored_s = 0.0 if follows or not self._followed else self._ignored_s + period_s
         return self._ignored_s >= BIT_S
 
+    def take_status_word(self, status_word: int) -> None:
+        """Store a status word that was sent."""
+        if status_word != self.status_word:
+            self.set_status_word(status_word)
+
+    def take_switches(self, switches: int) -> None:
+        """Store 0x60FD that was sent."""
+        self.switches = switches
+
     def set_status_word(self, status_word: int) -> None:
         """Store the newest status word."""
         self.status_word = status_word
@@ -210,6 +222,11 @@ class DriveAxis:
         return f"status word 0x{self.status_word:04X}: {self.state.value}"
 
 
+def _put(array: FloatArray | None, index: int, value: float) -> None:
+    if array is not None:
+        array[index] = value
+
+
 class Cia402Codec:
     """Codec of CiA 402 drives.
 
@@ -228,10 +245,6 @@ class Cia402Codec:
         self._events: list[AxisFault] = []
         self._sync = [CanFrame(SYNC_ID)]
         self._heartbeat = [CanFrame(HEARTBEAT_ID + options.master_id, bytes([NmtState.OPERATIONAL]))]
-        self._at_rest = {
-            word: [CanFrame(axis.command_id, _COMMAND.pack(word, 0)) for axis in self.axes]
-            for word in {*ENABLE_STEPS.values(), ControlWord.DISABLE_VOLTAGE, ControlWord.QUICK_STOP}
-        }
         self._period_s = 1.0 / options.rate_hz
         joints = options.joint
         self._low = np.array([joint.position_min for joint in joints])
@@ -242,83 +255,74 @@ class Cia402Codec:
             np.array([joint.max_velocity for joint in joints]),
             self._period_s,
         )
-        self.arrange([options.feedback] * len(self.axes))
+        plan = planned(TARGETS["csv"], options.feedback)
+        assert plan is not None  # by PDOs without restrictions
+        for axis in self.axes:
+            self.configured(axis, "csv", False, plan)
+        self.arrange([plan] * len(self.axes))
 
-    def arrange(self, feedback: list[tuple[str, ...]]) -> None:
-        """Expect ``feedback`` of each drive in addition to its status word and position; all send the same, except
-        switches.
-        """
+    def arrange(self, plans: list[PdoPlan]) -> None:
+        """Expect what the drives send by ``plans``; efforts and following errors are known if all send them."""
         count = len(self.axes)
+
+        def sent_by_all(what: str) -> bool:
+            return all(plan.sends(what) for plan in plans)
+
         self.feedback = Feedback(
             positions=np.full(count, np.nan),
             velocities=np.full(count, np.nan),
-            efforts=np.full(count, np.nan) if "effort" in feedback[0] else None,
-            following_errors=np.full(count, np.nan) if "following_error" in feedback[0] else None,
+            efforts=np.full(count, np.nan) if sent_by_all("effort") else None,
+            following_errors=np.full(count, np.nan) if sent_by_all("following_error") else None,
         )
         self._takers: dict[int, Callable[[bytes], int]] = {}
         bits: list[tuple[int, str]] = []
-        for axis, sent in zip(self.axes, feedback, strict=True):
+        for axis, plan in zip(self.axes, plans, strict=True):
             axis.switches = None
-            self._register(axis, tpdo_feedback(sent), bits)
+            for pdo in plan.reports:
+                self._takers[TPDO_IDS[pdo.number] + axis.node_id] = self._report(axis, pdo, len(bits))
+                bits.append((axis.index, f"TPDO{pdo.number + 1} of node {axis.node_id}"))
+            self._takers[EMCY_ID + axis.node_id] = partial(self._take_emergency, axis)
+            self._takers[HEARTBEAT_ID + axis.node_id] = partial(self._take_heartbeat, axis)
         self.expected = (1 << len(bits)) - 1
         self.bit_axis = tuple(index for index, _ in bits)
         self.bit_name = tuple(name for _, name in bits)
 
-    def configured(self, axis: DriveAxis, mode: CommandMode, guarded: bool) -> None:
-        """Store how a drive was configured."""
+    def configured(
+        self, axis: DriveAxis, mode: CommandMode, guarded: bool, plan: PdoPlan, held: Mapping[int, bytes] = _NOTHING
+    ) -> None:
+        """Store how a drive was configured. ``held``: by number of an RPDO, the bytes that do not change."""
         axis.mode = mode
         axis.guarded = guarded
-        guarded = [CanFrame(HEARTBEAT_ID + a.node_id, remote=True, length=1) for a in self.axes if a.guarded]
-        self._heartbeat = [self._heartbeat[0], *guarded]
+        axis.commands = [
+            CommandPdo(pdo, axis.node_id, TARGETS[mode], held.get(pdo.number, b"")) for pdo in plan.commands
+        ]
+        remote = [CanFrame(HEARTBEAT_ID + a.node_id, remote=True, length=1) for a in self.axes if a.guarded]
+        self._heartbeat = [self._heartbeat[0], *remote]
 
     # -- receiving ------------------------------------------------------------------------------------------
 
-    def _register(self, axis: DriveAxis, further: tuple[tuple[str, ...], ...], bits: list[tuple[int, str]]) -> None:
-        node = axis.node_id
-        decoders = [self._status_and_position(axis, len(bits))]
-        decoders += [self._further(axis, pdo, k + 2, len(bits) + 1 + k) for k, pdo in enumerate(further)]
-        for number, decoder in enumerate(decoders):
-            self._takers[TPDO_IDS[number] + node] = decoder
-            bits.append((axis.index, f"TPDO{number + 1} of node {node}"))
-        self._takers[EMCY_ID + node] = lambda data: self._take_emergency(axis, data)
-        self._takers[HEARTBEAT_ID + node] = lambda data: self._take_heartbeat(axis, data)
-
-    def _status_and_position(self, axis: DriveAxis, bit: int) -> Callable[[bytes], int]:
-        positions, k = self.feedback.positions, axis.index
-        unpack, size = _STATUS_AND_POSITION.unpack, _STATUS_AND_POSITION.size
-        position, unwrapped = axis.scale.position, axis.counts.update
-
-        def take(data: bytes) -> int:
-            if len(data) != size:
-                return self._wrong_length(axis, "TPDO1", len(data), size)
-            word, counts = unpack(data)
-            if word != axis.status_word:
-                axis.set_status_word(word)
-            positions[k] = position(unwrapped(counts))
-            return bit
-
-        return take
-
-    def _further(self, axis: DriveAxis, pdo: tuple[str, ...], number: int, bit: int) -> Callable[[bytes], int]:
-        layout = struct.Struct("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
+    def _report(self, axis: DriveAxis, pdo: Pdo, bit: int) -> Callable[[bytes], int]:
+        """Decoder of a TPDO, which returns its ``bit``."""
         scale, feedback, k = axis.scale, self.feedback, axis.index
-        kinds: dict[str, tuple[FloatArray | None, Callable[[int], float]]] = {
-            "velocity": (feedback.velocities, scale.velocity),
-            "effort": (feedback.efforts, lambda permille: permille * axis.effort_unit),
-            "following_error": (feedback.following_errors, scale.difference),
-            "switches": (None, float),
+        unwrapped, effort_unit = axis.counts.update, axis.effort_unit
+        takers: dict[int, Callable[[int], None]] = {
+            STATUS_WORD: axis.take_status_word,
+            POSITION: lambda counts: _put(feedback.positions, k, scale.position(unwrapped(counts))),
+            FEEDBACK_OBJECTS["velocity"]: lambda units: _put(feedback.velocities, k, scale.velocity(units)),
+            FEEDBACK_OBJECTS["effort"]: lambda permille: _put(feedback.efforts, k, permille * effort_unit),
+            FEEDBACK_OBJECTS["following_error"]: lambda counts: _put(
+                feedback.following_errors, k, scale.difference(counts)
+            ),
+            FEEDBACK_OBJECTS["switches"]: axis.take_switches,
         }
-        targets = [kinds[what] for what in pdo]
-        unpack, size = layout.unpack, layout.size
+        layout = data_layout(pdo, tuple(takers))
+        unpack, size, setters = layout.unpack, layout.size, [takers[e] for e in pdo.mapping if e in takers]
 
         def take(data: bytes) -> int:
             if len(data) != size:
-                return self._wrong_length(axis, f"TPDO{number}", len(data), size)
-            for raw, (array, convert) in zip(unpack(data), targets, strict=True):
-                if array is None:
-                    axis.switches = raw
-                else:
-                    array[k] = convert(raw)
+                return self._wrong_length(axis, f"TPDO{pdo.number + 1}", len(data), size)
+            for value, put in zip(unpack(data), setters, strict=True):
+                put(value)
             return bit
 
         return take
@@ -481,9 +485,9 @@ class Cia402Codec:
         for axis, word in zip(self.axes, words, strict=True):
             axis.commanded = 0.0
             if axis.by_position:
-                frames.append(self._position(axis, word, float(orders[axis.index])))
+                frames += self._position(axis, word, float(orders[axis.index]))
             else:
-                frames.append(self._at_rest[word][axis.index])
+                frames += axis.frames(word, 0)
         return frames
 
     def idle(self) -> list[CanFrame]:
@@ -508,19 +512,17 @@ class Cia402Codec:
         for axis, velocity, order in zip(self.axes, velocities.tolist(), orders.tolist(), strict=True):
             axis.commanded = velocity
             if axis.by_position:
-                frames.append(self._position(axis, ControlWord.ENABLE_OPERATION, order, axis.mode == "ip"))
+                frames += self._position(axis, ControlWord.ENABLE_OPERATION, order, axis.mode == "ip")
             else:
-                target = axis.scale.velocity_units(velocity)
-                frames.append(CanFrame(axis.command_id, _COMMAND.pack(_ENABLE_OPERATION, target)))
+                frames += axis.frames(ControlWord.ENABLE_OPERATION, axis.scale.velocity_units(velocity))
         return frames
 
     @staticmethod
-    def _position(axis: DriveAxis, word: ControlWord, order: float, interpolate: bool = False) -> CanFrame:
-        """Frame with a position as set-point; without a known position the drive must not be enabled."""
+    def _position(axis: DriveAxis, word: ControlWord, order: float, interpolate: bool = False) -> list[CanFrame]:
+        """Frames with a position as set-point; without a known position the drive must not be enabled."""
         if math.isnan(order):
-            return CanFrame(axis.command_id, _COMMAND.pack(min(word, ControlWord.QUICK_STOP), 0))
-        counts = wrap_int32(axis.scale.counts(order))
-        return CanFrame(axis.command_id, _COMMAND.pack(word | INTERPOLATE * interpolate, counts))
+            return axis.frames(min(word, ControlWord.QUICK_STOP), 0)
+        return axis.frames(word | INTERPOLATE * interpolate, wrap_int32(axis.scale.counts(order)))
 
     def quick_stop(self) -> list[CanFrame]:
         """Frames: quick stop, target zero, in place of the stored cyclic control word."""

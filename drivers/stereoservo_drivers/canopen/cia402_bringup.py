@@ -24,11 +24,15 @@ from stereoservo_drivers.canopen.cia402 import (
 )
 from stereoservo_drivers.canopen.cia402_configuration import (
     ABORT_OPTION,
+    FAULT_REACTION,
     INTERPOLATION_EXPONENT,
     INTERPOLATION_TIME,
     MODES,
     PDO_OFF,
+    RPDOS,
+    TPDOS,
     Capabilities,
+    PdoObjects,
     Setup,
     Write,
     available_feedback,
@@ -37,6 +41,7 @@ from stereoservo_drivers.canopen.cia402_configuration import (
     eds_path,
     identifier_writes,
     load_eds,
+    mapped_object,
     parameter_writes,
     pdo_writes,
     period_writes,
@@ -52,8 +57,13 @@ from stereoservo_drivers.canopen.cia402_presence import (
     require_single_master,
 )
 from stereoservo_drivers.canopen.cia402_words import (
+    ABORT_NO_OBJECT,
+    ABORT_NO_SUBINDEX,
+    ABORT_NOT_MAPPABLE,
+    ABORT_PDO_FULL,
     ABORT_READ_ONLY,
     FAULTY,
+    NOT_WRITABLE,
     OUT_OF_RANGE,
     ControlWord,
     DriveState,
@@ -64,9 +74,20 @@ from stereoservo_drivers.canopen.cia402_words import (
     is_communication_error,
 )
 from stereoservo_drivers.canopen.codec import Link, listening, until
-from stereoservo_drivers.canopen.gripper import Gripper
-from stereoservo_drivers.canopen.option_checks import check_load
+from stereoservo_drivers.canopen.gripper import GRIPPER_PDOS, Gripper
+from stereoservo_drivers.canopen.option_checks import check_load, parse_sdo_key
 from stereoservo_drivers.canopen.options import CanOptions, CanOutput, CommandMode
+from stereoservo_drivers.canopen.pdo_plan import (
+    CONTROL_WORD,
+    TARGETS,
+    UNRESTRICTED,
+    Pdo,
+    PdoPlan,
+    Slot,
+    Slots,
+    planned,
+    restricted,
+)
 from stereoservo_drivers.canopen.units import wrap_int32
 from stereoservo_drivers.kit.auxiliary import verify_order
 
@@ -87,6 +108,10 @@ SETTLE_S = 0.03
 """Time within which a cause that is still present trips a drive again."""
 STANDS_SHARE = 0.01
 """Share of the largest velocity below which a drive is at rest."""
+FIXED_EFFECTS = {(FAULT_REACTION, 0): "at a fault of its own it lets its axis run out"}
+"""Effects of objects with values that cannot be changed, where they are bad."""
+LAST_DUMMY = 0x20
+"""Mapping entries below are placeholders (CiA 301)."""
 LOOK_S = 0.02
 """Time over which the positions of a drive without velocity feedback show whether it is at rest."""
 
@@ -228,11 +253,13 @@ class Cia402Bringup:
                 self.setups[drive.node_id] = compose(drive, self._options, has)
             else:
                 self.setups[drive.node_id] = gripper.compose(drive, has)
-        check_load(self._options, sum("guarding" in setup.watches for setup in self.setups.values()))
         feedback = available_feedback(self._options, found)
-        self.codec.arrange(feedback)
-        for drive, sent in zip(drives, [*feedback, *([()] * len(self.grippers))], strict=True):
-            self._configure(link, drive, sent)
+        asked = [*feedback, *([()] * len(self.grippers))]
+        plans = [self._configure(link, drive, wanted) for drive, wanted in zip(drives, asked, strict=True)]
+        joints = plans[: len(self.codec.axes)]
+        self.codec.arrange(joints)
+        guarded = sum("guarding" in setup.watches for setup in self.setups.values())
+        check_load(self._options, guarded, [length for plan in joints for length in plan.lengths])
 
     def _power_off(self, link: Link, drive: RemoteDrive) -> None:
         """Stop a drive that was left enabled, and switch it off. A fault remains."""
@@ -248,35 +275,111 @@ class Cia402Bringup:
                 "not_off", f"does not switch off, it says {drive.axis.words()!r}; switch its supply off and on"
             )
 
-    def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> None:
-        """Write the whole configuration, then read it back. Raises DriverError (``read_back``)."""
+    def _configure(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> PdoPlan:
+        """Write the whole configuration, then read it back; returns its PDOs. Raises DriverError (``read_back``)."""
         gripper, setup = self.grippers.get(drive.node_id), self.setups[drive.node_id]
         asked = parameter_writes(self._options, drive.axis.joint, setup)
         if gripper is not None:
             asked = gripper.parameters(setup)
-        parameters = [write for write in asked if not _fixed(drive, write)]
         identifiers = [write for write in identifier_writes(drive.node_id) if self._differs(drive, write)]
-        unused = unused_pdos(feedback, drive.dictionary)
-        off = [write for index in unused for write in self._off(drive, index)]
         # Without guarding from an earlier master: a life time that expires now would cause a fault.
         first = [write for write in unwatch_writes(setup) if "guarding" in setup.watches]
-        drive.write_all((*first, *identifiers, *off, *parameters))
+        drive.write_all((*first, *identifiers))
+        parameters = self._write_changeable(drive, asked)
         if gripper is None:
-            rest = self._set_mode(link, drive, setup, feedback)
+            plan, rest = self._set_mode(link, drive, feedback)
         else:
-            rest = gripper.set_mode(link, drive)
-        for write in {write.key: write for write in (*identifiers, *off, *parameters, *rest)}.values():
+            plan, rest = GRIPPER_PDOS, gripper.set_mode(link, drive)
+        off = [write for index in unused_pdos(plan, drive.dictionary) for write in self._off(drive, index)]
+        off = self._write_changeable(drive, off)
+        for write in {write.key: write for write in (*identifiers, *parameters, *rest, *off)}.values():
             self._compare(drive, write)
         self.outputs.prepare(drive)
+        return plan
 
-    def _set_mode(self, link: Link, drive: RemoteDrive, setup: Setup, feedback: tuple[str, ...]) -> list[Write]:
-        """Write mode, period and PDOs of a joint's drive; returns the writes to read back. Raises DriverError."""
+    def _write_changeable(self, drive: RemoteDrive, writes: list[Write]) -> list[Write]:
+        """Write what differs, and return it: a value that the drive does not let change remains, as a loss. Raises
+        DriverError, also if an option asks for just that object.
+        """
+        written = []
+        for write in writes:
+            if write.option != "sdo" and not self._differs(drive, write):
+                continue
+            try:
+                drive.write(write.index, write.subindex, write.value, write.option)
+            except DriverError as error:
+                if error.data.get("abort_code") not in NOT_WRITABLE or write.option in ("sdo", "heartbeat_ms"):
+                    raise
+                value = drive.read(write.index, write.subindex)
+                effect = FIXED_EFFECTS.get((write.key, value), f"{write.value} was to be written")
+                self._lose(drive, f"0x{write.index:04X}:{write.subindex} is fixed at {value}: {effect}")
+            else:
+                written.append(write)
+        return written
+
+    def _lose(self, drive: RemoteDrive, text: str) -> None:
+        """Add a restriction of the drive to its setup."""
+        setup = self.setups[drive.node_id]
+        self.setups[drive.node_id] = replace(setup, losses=(*setup.losses, text))
+
+    def _set_mode(self, link: Link, drive: RemoteDrive, feedback: tuple[str, ...]) -> tuple[PdoPlan, list[Write]]:
+        """Write mode, period and PDOs of a joint's drive; returns its PDOs and the writes to read back. Raises
+        DriverError.
+        """
+        setup = self.setups[drive.node_id]
         mode = self._choose_mode(link, drive, setup)
         period = self._write_period(drive, mode)
-        pdos = pdo_writes(self._options, drive.node_id, setup, mode, feedback)
-        drive.write_all(pdos)
-        self.codec.configured(drive.axis, mode, "guarding" in setup.watches)
-        return [*period, *pdos]
+        plan, fixed, writes = self._write_pdos(drive, mode, feedback)
+        known = (CONTROL_WORD, TARGETS[mode])
+        held = {pdo.number: _held_bytes(drive, pdo, known) for pdo in plan.commands if pdo.number in fixed}
+        self.codec.configured(drive.axis, mode, "guarding" in setup.watches, plan, held)
+        for what in feedback:
+            if not plan.sends(what):
+                self._lose(drive, f"{what} is not sent: the drive's TPDOs have no place for it")
+        return plan, [*period, *writes]
+
+    def _write_pdos(
+        self, drive: RemoteDrive, mode: CommandMode, feedback: tuple[str, ...]
+    ) -> tuple[PdoPlan, set[int], list[Write]]:
+        """Write the PDOs that the drive permits: after a refusal, the plan is solved again without what was refused.
+
+        Returns the plan, the numbers of RPDOs of fixed mapping, and the writes. Raises DriverError (``no_pdos``) if the
+        drive cannot be commanded or read by PDOs.
+        """
+        slots: dict[PdoObjects, Slots] = {RPDOS: UNRESTRICTED, TPDOS: UNRESTRICTED}
+        refused: list[str] = []
+        while True:
+            plan = planned(TARGETS[mode], feedback, slots[RPDOS], slots[TPDOS])
+            if plan is None:
+                raise drive.error(
+                    "no_pdos",
+                    "its PDOs cannot carry control word and set-point (RPDOs), or status word and position (TPDOs): "
+                    + "; ".join(dict.fromkeys(refused)),
+                    mode=mode,
+                )
+            writes: list[Write] = []
+            for objects, pdo in [*((RPDOS, pdo) for pdo in plan.commands), *((TPDOS, pdo) for pdo in plan.reports)]:
+                slot = slots[objects][pdo.number]
+                try:
+                    writes += self._write_pdo(drive, objects, pdo, fixed=slot.fixed is not None)
+                except DriverError as error:
+                    refused.append(str(error))
+                    slots[objects] = restricted(
+                        slots[objects], pdo.number, _slot_after_refusal(drive, objects, pdo, slot, error)
+                    )
+                    break
+            else:
+                fixed = {number for number, slot in enumerate(slots[RPDOS]) if slot.fixed is not None}
+                return plan, fixed, writes
+
+    def _write_pdo(self, drive: RemoteDrive, objects: PdoObjects, pdo: Pdo, *, fixed: bool) -> list[Write]:
+        """Write a PDO, of which a ``fixed`` one is changed only where it differs; returns the writes."""
+        setup = self.setups[drive.node_id]
+        deadline = "deadline" in setup.watches and objects is RPDOS and pdo.number == 0
+        deadline_ms = self._options.rpdo_deadline_ms if deadline else 0
+        writes = pdo_writes(objects, pdo, drive.node_id, fixed=fixed, deadline_ms=deadline_ms)
+        drive.write_all([write for write in writes if not fixed or self._differs(drive, write)])
+        return writes
 
     def _write_period(self, drive: RemoteDrive, mode: CommandMode) -> list[Write]:
         """Write the period of set-points; returns the writes.
@@ -294,11 +397,11 @@ class Cia402Bringup:
             value, exponent = (
                 setup.capabilities.values.get(key, 0) for key in (INTERPOLATION_TIME, INTERPOLATION_EXPONENT)
             )
-            kept = (
+            self._lose(
+                drive,
                 f"0x60C2 is fixed at {value * 10.0 ** (exponent + 3):g} ms, and a cycle has "
-                f"{1e3 / self._options.rate_hz:g} ms: the drive may ramp between set-points or miss some"
+                f"{1e3 / self._options.rate_hz:g} ms: the drive may ramp between set-points or miss some",
             )
-            self.setups[drive.node_id] = replace(setup, losses=(*setup.losses, kept))
             return []
         return writes
 
@@ -325,8 +428,9 @@ class Cia402Bringup:
 
     @staticmethod
     def _off(drive: RemoteDrive, index: int) -> list[Write]:
+        """Write that switches a PDO off, if there is one that is on."""
         cob_id = drive.read_if_there(index, 1)
-        return [] if cob_id is None else [Write(index, 1, cob_id | PDO_OFF, PDO_OFF)]
+        return [] if cob_id is None or cob_id & PDO_OFF else [Write(index, 1, cob_id | PDO_OFF, PDO_OFF)]
 
     @staticmethod
     def _compare(drive: RemoteDrive, write: Write) -> None:
@@ -419,10 +523,42 @@ class Cia402Bringup:
         )
 
 
-def _fixed(drive: RemoteDrive, write: Write) -> bool:
-    """Whether a value that no option requests cannot be set, according to the EDS: the drive's own value remains."""
-    variable = drive.variable(write.index, write.subindex)
-    return not write.option and variable is not None and not variable.writable
+def _slot_after_refusal(drive: RemoteDrive, objects: PdoObjects, pdo: Pdo, slot: Slot, error: DriverError) -> Slot:
+    """What a PDO can hold, after the drive refused a write of ``pdo``. Raises ``error`` if it is of another kind."""
+    code, (index, subindex) = error.data.get("abort_code"), parse_sdo_key(str(error.data.get("object", "0x1:0")))
+    if code is None:
+        raise error
+    if index != objects.mapping + pdo.number or slot.fixed is not None:
+        return Slot(entries=0)  # it is not there, or cannot be used at these times
+    if code in NOT_WRITABLE or (subindex == 0 and error.data["value"] == 0):
+        return _fixed_slot(drive, objects, index)
+    if code == ABORT_NOT_MAPPABLE and subindex:
+        return slot._replace(excluded=slot.excluded | {pdo.mapping[subindex - 1]})
+    if subindex == 0:
+        return slot._replace(entries=len(pdo.mapping) - 1)
+    if code in (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX, ABORT_PDO_FULL):
+        return slot._replace(entries=subindex - 1)
+    raise error
+
+
+def _fixed_slot(drive: RemoteDrive, objects: PdoObjects, index: int) -> Slot:
+    """A PDO with the mapping that the drive has; unusable if it holds single bits, or digital outputs that would be
+    held as they are.
+    """
+    mapping = tuple(drive.read(index, place + 1) for place in range(drive.read(index)))
+    outputs = objects is RPDOS and any(mapped_object(entry)[0] == OUTPUTS[0] for entry in mapping)
+    usable = mapping and not outputs and all(entry & 0xFF and entry % 8 == 0 for entry in mapping)
+    return Slot(fixed=mapping) if usable else Slot(entries=0)
+
+
+def _held_bytes(drive: RemoteDrive, pdo: Pdo, known: tuple[int, ...]) -> bytes:
+    """Data of an RPDO of fixed mapping: the drive's own values, zeros for the ``known`` entries and dummies."""
+    held = b""
+    for entry in pdo.mapping:
+        index, subindex = mapped_object(entry)
+        value = 0 if entry in known or index < LAST_DUMMY else drive.read(index, subindex)
+        held += (value & (1 << (entry & 0xFF)) - 1).to_bytes((entry & 0xFF) // 8, "little")
+    return held
 
 
 def _out_of_range(error: DriverError) -> bool:

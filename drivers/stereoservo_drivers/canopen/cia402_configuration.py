@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, FEEDBACK_OBJECTS, RPDO_IDS, SYNC_ID, TPDO_IDS, tpdo_mappings
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, SYNC_ID
 from stereoservo_drivers.canopen.eds_files import read_eds
 from stereoservo_drivers.canopen.option_checks import parse_sdo_key
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions, CommandMode
+from stereoservo_drivers.canopen.pdo_plan import FEEDBACK_OBJECTS, PDOS, RPDO_IDS, TARGETS, TPDO_IDS, Pdo, PdoPlan
 from stereoservo_drivers.canopen.units import JointScale
 
 if TYPE_CHECKING:
@@ -28,14 +29,7 @@ Watch = Literal["heartbeat", "guarding", "deadline"]
 
 MODES: dict[CommandMode, int] = {"csv": 9, "pv": 3, "csp": 8, "ip": 7}
 """Mode of operation -> its number in 0x6060, the preferred one first."""
-TARGETS: dict[CommandMode, tuple[int, int]] = {
-    "csv": (0x60FF, 0),
-    "pv": (0x60FF, 0),
-    "csp": (0x607A, 0),
-    "ip": (0x60C1, 1),
-}
-"""Object of the set-point of each mode."""
-FEEDBACK_INDEX = {what: entry >> 16 for what, (entry, _) in FEEDBACK_OBJECTS.items()}
+FEEDBACK_INDEX = {what: entry >> 16 for what, entry in FEEDBACK_OBJECTS.items()}
 HEARTBEAT_CONSUMER = (0x1016, 1)
 GUARD_TIME, LIFE_FACTOR = (0x100C, 0), (0x100D, 0)
 DEADLINE = (0x1400, 5)
@@ -45,10 +39,16 @@ SPEEDS = ((0x607F, 0), (0x6080, 0))
 RAMPS = ((0x6083, 0), (0x6084, 0))
 INTERPOLATION_TIME, INTERPOLATION_EXPONENT = (0x60C2, 1), (0x60C2, 2)
 
+
+def mapped_object(entry: int) -> tuple[int, int]:
+    """Index and sub-index of a mapping entry."""
+    return entry >> 16, entry >> 8 & 0xFF
+
+
 PROBED = (
     HEARTBEAT_CONSUMER, GUARD_TIME, LIFE_FACTOR, DEADLINE, ABORT_OPTION, QUICK_STOP_OPTION, QUICK_STOP_RAMP,
     FAULT_REACTION, *SPEEDS, *RAMPS, INTERPOLATION_TIME, INTERPOLATION_EXPONENT,
-    *dict.fromkeys(TARGETS.values()), *((index, 0) for index in FEEDBACK_INDEX.values()),
+    *dict.fromkeys(map(mapped_object, TARGETS.values())), *((index, 0) for index in FEEDBACK_INDEX.values()),
 )  # fmt: skip
 
 LOSSES = {
@@ -112,9 +112,6 @@ def compose(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> Setup
     """The safest configuration of a drive. Raises DriverError (``mode``, ``no_watch``)."""
     joint = drive.axis.joint
     losses = [text for key, text in LOSSES.items() if not has.has(key)]
-    reaction = drive.variable(*FAULT_REACTION)
-    if reaction is not None and not reaction.writable and has.values.get(FAULT_REACTION) == 0:
-        losses.append("0x605E is fixed at 0: at a fault of its own it lets its axis run out")
     if "switches" in options.feedback and not has.has((FEEDBACK_INDEX["switches"], 0)):
         losses.append(NO_SWITCHES)
     watches = watches_of(options, has)
@@ -160,7 +157,7 @@ def _modes(drive: RemoteDrive, options: CanOptions, has: Capabilities) -> tuple[
 def usable(mode: CommandMode, has: Capabilities) -> bool:
     """Whether a drive has a mode (by 0x6502 if reported), and the object of its set-point."""
     stated = has.modes is None or bool(has.modes >> (MODES[mode] - 1) & 1)
-    return stated and has.has(TARGETS[mode])
+    return stated and has.has(mapped_object(TARGETS[mode]))
 
 
 def available_feedback(options: CanOptions, drives: list[Capabilities]) -> list[tuple[str, ...]]:
@@ -204,13 +201,25 @@ PDO_OFF = 1 << 31
 _COB_ID_MASK = 0xBFFFFFFF
 """Bit 30 of a TPDO's COB-ID (no remote frames) may be fixed in the drive."""
 _WHOLE = 0xFFFFFFFF
-ON_EVERY_SYNC = 1
-AT_ONCE = 255
 FAULT_REACTION_QUICK_STOP = 2
 
-CONTROL_WORD = 0x60400010
-RPDO_COMMUNICATION, RPDO_MAPPING = 0x1400, 0x1600
-TPDO_COMMUNICATION, TPDO_MAPPING = 0x1800, 0x1A00
+
+class PdoObjects(NamedTuple):
+    """Objects and settings of the PDOs in one direction: the first indices of ``communication`` and ``mapping``, the
+    COB-IDs without the node's, and the ``transmission`` type.
+    """
+
+    name: str
+    communication: int
+    mapping: int
+    cob_ids: tuple[int, ...]
+    transmission: int
+
+
+RPDOS = PdoObjects("RPDO", 0x1400, 0x1600, RPDO_IDS, 255)
+"""Received PDOs take effect at once."""
+TPDOS = PdoObjects("TPDO", 0x1800, 0x1A00, TPDO_IDS, 1)
+"""Sent PDOs come with every SYNC."""
 PDO_RANGE = 0x200
 
 
@@ -303,40 +312,34 @@ def unwatch_writes(setup: Setup) -> list[Write]:
     return [Write(*LIFE_FACTOR, 0), Write(*GUARD_TIME, 0)] if "guarding" in setup.watches else []
 
 
-def one_pdo_writes(
-    number: int, base: tuple[int, int], cob_id: int, mapping: tuple[int, ...], transmission: int, deadline_ms: int
+def pdo_writes(
+    objects: PdoObjects, pdo: Pdo, node_id: int, *, fixed: bool = False, deadline_ms: int = 0
 ) -> list[Write]:
-    """Writes of one PDO in the order of CiA 301: off, no mapping, mapping, type, deadline, on."""
-    communication, mapped = base[0] + number, base[1] + number
-    writes = [Write(communication, 1, cob_id | PDO_OFF, _COB_ID_MASK), Write(mapped, 0, 0)]
-    writes += [Write(mapped, place + 1, entry, option="feedback") for place, entry in enumerate(mapping)]
-    writes += [Write(mapped, 0, len(mapping)), Write(communication, 2, transmission)]
+    """Writes of one PDO in the order of CiA 301: off, no mapping, mapping, type, deadline, on. ``fixed``: its mapping
+    cannot be changed.
+    """
+    communication, mapped = objects.communication + pdo.number, objects.mapping + pdo.number
+    cob_id = objects.cob_ids[pdo.number] + node_id
+    writes = []
+    if not fixed:
+        writes += [Write(communication, 1, cob_id | PDO_OFF, _COB_ID_MASK), Write(mapped, 0, 0)]
+        writes += [Write(mapped, place + 1, entry, option="feedback") for place, entry in enumerate(pdo.mapping)]
+        writes.append(Write(mapped, 0, len(pdo.mapping)))
+    writes.append(Write(communication, 2, objects.transmission))
     if deadline_ms:
         writes.append(Write(communication, DEADLINE[1], deadline_ms, option="rpdo_deadline_ms"))
     return [*writes, Write(communication, 1, cob_id, _COB_ID_MASK)]
 
 
-def pdo_writes(
-    options: CanOptions, node_id: int, setup: Setup, mode: CommandMode, feedback: tuple[str, ...]
-) -> list[Write]:
-    """Writes of the mapping of RPDO1 and the TPDOs in use, in order."""
-    rpdo = (RPDO_COMMUNICATION, RPDO_MAPPING)
-    tpdo = (TPDO_COMMUNICATION, TPDO_MAPPING)
-    index, subindex = TARGETS[mode]
-    command = (CONTROL_WORD, index << 16 | subindex << 8 | 32)
-    deadline_ms = options.rpdo_deadline_ms if "deadline" in setup.watches else 0
-    writes = one_pdo_writes(0, rpdo, RPDO_IDS[0] + node_id, command, AT_ONCE, deadline_ms)
-    for number, mapping in enumerate(tpdo_mappings(feedback)):
-        writes += one_pdo_writes(number, tpdo, TPDO_IDS[number] + node_id, mapping, ON_EVERY_SYNC, 0)
-    return writes
-
-
-def unused_pdos(feedback: tuple[str, ...], dictionary: canopen.ObjectDictionary) -> list[int]:
-    """Communication objects of all other PDOs of the EDS: a drive may have them enabled by default."""
-    used = len(tpdo_mappings(feedback))
-    rpdos = range(RPDO_COMMUNICATION + 1, RPDO_COMMUNICATION + PDO_RANGE)
-    tpdos = range(TPDO_COMMUNICATION + used, TPDO_COMMUNICATION + PDO_RANGE)
-    return [index for index in dictionary if index in rpdos or index in tpdos]
+def unused_pdos(plan: PdoPlan, dictionary: canopen.ObjectDictionary) -> list[int]:
+    """Communication objects of all PDOs but those of the plan: a drive may have them enabled by default."""
+    found = []
+    for objects, used in ((RPDOS, plan.commands), (TPDOS, plan.reports)):
+        first = objects.communication
+        standard = range(first, first + PDOS)
+        listed = [index for index in dictionary if first + PDOS <= index < first + PDO_RANGE]
+        found += [index for index in (*standard, *listed) if index - first not in {pdo.number for pdo in used}]
+    return found
 
 
 def eds_path(options: CanOptions, cell_dir: Path) -> Path:

@@ -37,7 +37,7 @@ ABSENT = (ABORT_NO_OBJECT, ABORT_NO_SUBINDEX)
 
 SIZES: dict[tuple[int, int], tuple[int, bool]] = {
     (0x100C, 0): (2, False), (0x100D, 0): (1, False), (0x1016, 1): (4, False), (0x1017, 0): (2, False),
-    (0x1400, 5): (2, False), (0x6007, 0): (2, True), (0x603F, 0): (2, False), (0x605A, 0): (2, True),
+    (0x6007, 0): (2, True), (0x603F, 0): (2, False), (0x605A, 0): (2, True),
     (0x605E, 0): (2, True), (0x6060, 0): (1, True), (0x6061, 0): (1, True), (0x6064, 0): (4, True),
     (0x606C, 0): (4, True), (0x6077, 0): (2, True), (0x607A, 0): (4, True), (0x607F, 0): (4, False),
     (0x6080, 0): (4, False), (0x6083, 0): (4, False), (0x6084, 0): (4, False), (0x6085, 0): (4, False),
@@ -46,6 +46,8 @@ SIZES: dict[tuple[int, int], tuple[int, bool]] = {
     (0x6502, 0): (4, False),
 }  # fmt: skip
 """Sizes [bytes] and signs of standard objects (CiA 301, CiA 402-2), for drives with an EDS that omits them."""
+PDO_COMMUNICATION_SIZES = {0: 1, 1: 4, 2: 1, 3: 2, 4: 1, 5: 2, 6: 1}
+"""Sizes [bytes] of the sub-indices of a PDO's communication record; of its mapping record, all are 4 but the first."""
 
 
 class LinkNetwork(canopen.Network):
@@ -146,6 +148,10 @@ class RemoteDrive:
         variable = self.variable(index, subindex)
         if variable is not None and variable.fixed_size:
             return len(variable) // 8, variable.data_type in SIGNED_TYPES
+        if 0x1600 <= index < 0x1800 or 0x1A00 <= index < 0x1C00:
+            return (4 if subindex else 1), False
+        if 0x1400 <= index < 0x1A00 and subindex in PDO_COMMUNICATION_SIZES:
+            return PDO_COMMUNICATION_SIZES[subindex], False
         return SIZES.get((index, subindex))
 
     def read_if_there(self, index: int, subindex: int = 0) -> int | None:
@@ -158,20 +164,16 @@ class RemoteDrive:
             raise
 
     def write(self, index: int, subindex: int, value: int, option: str = "") -> None:
-        """Write an object of the EDS or the standard. ``option``: the cell file's, for errors.
+        """Write an object; one that neither its EDS nor the standard describes in the size in which the drive sends it.
 
-        Raises:
-            DriverError: ``wrong_eds`` (unknown to both), ``option`` (outside the EDS's range), ``sdo_abort``,
-                ``sdo_timeout``.
+        ``option``: the cell file's, for errors. Raises DriverError: ``option`` (outside the EDS's range),
+        ``sdo_abort``, ``sdo_timeout``.
         """
         variable, layout = self.variable(index, subindex), self._layout(index, subindex)
-        if layout is None:
-            raise DriverError(
-                "wrong_eds",
-                f"{self.name}: the EDS has no object 0x{index:04X}:{subindex}{_from(option)}; give the drive's own EDS",
-                **self._data(index, subindex, value),
-            )
-        size, signed = layout
+        try:
+            size, signed = layout or (len(ReadableStream(self._client, index, subindex).read()), value < 0)
+        except (SdoAbortedError, SdoCommunicationError) as error:
+            raise self._failed("writing", index, subindex, value, error, option) from error
         low = -(1 << 8 * size - 1) if signed else 0
         high = (1 << 8 * size - signed) - 1
         if variable is not None:

@@ -225,12 +225,16 @@ def is_communication_error(code: int) -> bool:
 
 
 ABORT_READ_ONLY = 0x06010002
+NOT_WRITABLE = (0x06010000, ABORT_READ_ONLY)
+"""Codes of objects that cannot be changed."""
+ABORT_NOT_MAPPABLE, ABORT_PDO_FULL = 0x06040041, 0x06040042
 ABORT_NO_OBJECT = 0x06020000
 ABORT_NO_SUBINDEX = 0x06090011
 OUT_OF_RANGE = (0x06090030, 0x06090031, 0x06090032)
 """Codes of values that an object does not accept."""
 
 _FIT = "does the EDS fit this drive?"
+_OBJECT = "look index and sub-index up in the drive's manual"
 _RANGE = "compare the value with the range in the drive's manual"
 _STATE = "switch the drive's power stage off, or disable the PDO that holds the object"
 
@@ -242,19 +246,19 @@ ABORT_CODES: dict[int, tuple[str, str]] = {
     0x05040003: ("invalid sequence number", "two masters on the bus?"),
     0x05040004: ("CRC error", "check cable and termination"),
     0x05040005: ("out of memory", "power the drive off and on"),
-    0x06010000: ("unsupported access to an object", _FIT),
+    NOT_WRITABLE[0]: ("unsupported access to an object", _OBJECT),
     0x06010001: ("read of a write-only object", _FIT),
-    ABORT_READ_ONLY: ("write to a read-only object", _FIT),
-    0x06020000: ("object does not exist", _FIT),
-    0x06040041: ("object cannot be mapped", "choose other [feedback], or does the EDS fit this drive?"),
-    0x06040042: ("mapped objects exceed the PDO's length", "the drive takes fewer bytes in a PDO"),
+    ABORT_READ_ONLY: ("write to a read-only object", _OBJECT),
+    ABORT_NO_OBJECT: ("object does not exist", _OBJECT),
+    ABORT_NOT_MAPPABLE: ("object cannot be mapped", "choose other [feedback], or does the EDS fit this drive?"),
+    ABORT_PDO_FULL: ("mapped objects exceed the PDO's length", "the drive takes fewer bytes in a PDO"),
     0x06040043: ("general parameter incompatibility", _FIT),
     0x06040047: ("general internal incompatibility in the device", _STATE),
     0x06060000: ("access failed due to a hardware error", "power the drive off and on"),
     0x06070010: ("data type or length does not match", _FIT),
     0x06070012: ("data type does not match, too long", _FIT),
     0x06070013: ("data type does not match, too short", _FIT),
-    0x06090011: ("sub-index does not exist", _FIT),
+    ABORT_NO_SUBINDEX: ("sub-index does not exist", _OBJECT),
     0x06090030: ("value range exceeded", _RANGE),
     0x06090031: ("value too high", _RANGE),
     0x06090032: ("value too low", _RANGE),

@@ -15,22 +15,18 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, RPDO_IDS, STATUS_AND_POSITION, TPDO_IDS, DriveAxis
+from stereoservo_drivers.canopen.cia402 import EMCY_ID, HEARTBEAT_ID, DriveAxis
 from stereoservo_drivers.canopen.cia402_configuration import (
-    AT_ONCE,
-    CONTROL_WORD,
     HEARTBEAT_CONSUMER,
     LOSSES,
-    RPDO_COMMUNICATION,
-    RPDO_MAPPING,
-    TPDO_COMMUNICATION,
-    TPDO_MAPPING,
+    RPDOS,
+    TPDOS,
     Capabilities,
     Setup,
     Write,
     eds_path,
-    one_pdo_writes,
     parameter_writes,
+    pdo_writes,
 )
 from stereoservo_drivers.canopen.cia402_words import (
     ENABLE_STEPS,
@@ -43,6 +39,7 @@ from stereoservo_drivers.canopen.cia402_words import (
 from stereoservo_drivers.canopen.codec import AxisFault, Link, until
 from stereoservo_drivers.canopen.option_checks import syncs_of_gripper
 from stereoservo_drivers.canopen.options import CanGripper, CanOptions
+from stereoservo_drivers.canopen.pdo_plan import CONTROL_WORD, RPDO_IDS, STATUS_AND_POSITION, TPDO_IDS, Pdo, PdoPlan
 from stereoservo_drivers.canopen.units import wrap_int32
 
 if TYPE_CHECKING:
@@ -61,6 +58,7 @@ NO_WATCH = (
     "0x1016:1 is not there: where this computer dies the gripper goes on to the position that it was ordered to, and "
     "stays there"
 )
+GRIPPER_PDOS = PdoPlan((Pdo(0, (TARGET_POSITION[0] << 16 | 32, CONTROL_WORD)),), (Pdo(0, STATUS_AND_POSITION),))
 _POSITION_AND_WORD, _WORD_AND_POSITION = struct.Struct("<iH"), struct.Struct("<Hi")
 
 
@@ -121,13 +119,9 @@ class Gripper:
 
     def set_mode(self, link: Link, drive: RemoteDrive) -> list[Write]:
         """Write mode and PDOs; returns the writes to read back. Raises DriverError."""
-        rpdo, tpdo = (RPDO_COMMUNICATION, RPDO_MAPPING), (TPDO_COMMUNICATION, TPDO_MAPPING)
-        node, target = drive.node_id, TARGET_POSITION[0] << 16 | 32
-        syncs = syncs_of_gripper(self._options.rate_hz)
-        pdos = [
-            *one_pdo_writes(0, rpdo, RPDO_IDS[0] + node, (target, CONTROL_WORD), AT_ONCE, 0),
-            *one_pdo_writes(0, tpdo, TPDO_IDS[0] + node, STATUS_AND_POSITION, syncs, 0),
-        ]
+        tpdos = TPDOS._replace(transmission=syncs_of_gripper(self._options.rate_hz))
+        pdos = [write for pdo in GRIPPER_PDOS.commands for write in pdo_writes(RPDOS, pdo, drive.node_id)]
+        pdos += [write for pdo in GRIPPER_PDOS.reports for write in pdo_writes(tpdos, pdo, drive.node_id)]
         drive.write(0x6060, 0, PROFILE_POSITION, "mode")
         until(link, lambda: drive.read(0x6061) == PROFILE_POSITION, MODE_S)
         drive.write_all(pdos)
@@ -258,7 +252,7 @@ class Gripper:
     def _command(self, word: int) -> CanFrame:
         target = self.position if self._target is None else self._target
         counts = 0 if math.isnan(target) else wrap_int32(self.axis.scale.counts(target))
-        return CanFrame(self.axis.command_id, _POSITION_AND_WORD.pack(counts, word))
+        return CanFrame(RPDO_IDS[0] + self.axis.node_id, _POSITION_AND_WORD.pack(counts, word))
 
     def _overdue(self, now_ns: int) -> AxisFault | None:
         for what, heard_ns, code in (

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import math
 import re
-import struct
 from collections.abc import Callable, Sequence
 from typing import Any
 
 from stereoservo.messages.addresses import without_secrets
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.load import BusLoad, cycle_load, refusal
-from stereoservo_drivers.canopen.cia402 import FEEDBACK_OBJECTS, tpdo_feedback
 from stereoservo_drivers.canopen.odrive import SHARE
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
+from stereoservo_drivers.canopen.pdo_plan import TARGETS, planned
 from stereoservo_drivers.canopen.units import INT32_MAX, UINT32_MAX, JointScale
 
 LONGEST_TURN = 2.0 * math.pi
@@ -66,9 +65,9 @@ def check_options(options: CanOptions) -> None:
     check_load(options)
 
 
-def check_load(options: CanOptions, guarded: int = 0) -> None:
-    """Check the bus's load, with the number of drives ``guarded`` by remote frames. Raises DriverError (``option``)."""
-    load = bus_load(options, guarded)
+def check_load(options: CanOptions, guarded: int = 0, frames: list[int] | None = None) -> None:
+    """Check the bus's load; arguments as of `bus_load`. Raises DriverError (``option``)."""
+    load = bus_load(options, guarded, frames)
     why = refusal(load, options.max_bus_load)
     if why is not None:
         raise DriverError(
@@ -111,23 +110,24 @@ def syncs_of_gripper(rate_hz: float) -> int:
     return min(max(round(rate_hz / GRIPPER_HZ), 1), LAST_SYNCHRONOUS)
 
 
-def bus_load(options: CanOptions, guarded: int = 0) -> BusLoad:
-    """Worst-case load of the cycle and of the heartbeats, with the number of drives ``guarded``."""
+def bus_load(options: CanOptions, guarded: int = 0, frames: list[int] | None = None) -> BusLoad:
+    """Worst-case load of the cycle and of the heartbeats. ``guarded``: number of drives that are guarded by remote
+    frames; ``frames``: lengths [bytes] of the joints' frames in a cycle, by default as of drives without restrictions.
+    """
     n = len(options.joint)
     if options.protocol == "odrive":
         asked_in_turn = (2 if "effort" in options.feedback else 1) * min(SHARE, n)
         # Estimates are requested by a remote frame, answered, and followed by a velocity; errors and torques in turn.
         lengths = [0, 8, 8] * n + [0, 8] * asked_in_turn
         return cycle_load(lengths, options.rate_hz, options.bitrate, [(8, n * ODRIVE_HEARTBEATS_S)])
-    further = [
-        struct.calcsize("<" + "".join(FEEDBACK_OBJECTS[what][1] for what in pdo))
-        for pdo in tpdo_feedback(options.feedback)
-    ]
+    if frames is None:
+        plan = planned(TARGETS["csv"], options.feedback)
+        frames = [] if plan is None else plan.lengths * n
     per_second = 1000.0 / options.heartbeat_ms
     grippers = len(options.gripper)
     beside = [(1, (n + grippers + 1) * per_second), (0, guarded * per_second)]
     beside.append((6, grippers * options.rate_hz / syncs_of_gripper(options.rate_hz)))
-    return cycle_load([0, *[6, 6, *further] * n], options.rate_hz, options.bitrate, beside)
+    return cycle_load([0, *frames], options.rate_hz, options.bitrate, beside)
 
 
 def _check_unique(drives: Sequence[CanJoint], option: str, of: Callable[[CanJoint], Any]) -> None:

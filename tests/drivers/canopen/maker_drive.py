@@ -149,9 +149,9 @@ class MakerDrive:
             self._answer_sync(operational)
         elif frame.id == 0x77F:
             self.heard_ns = t_ns
-        elif operational and frame.id == self.get(0x1400, 1) & 0x7FF and not self.get(0x1400, 1) >> 31:
+        elif operational and (number := self._received(frame.id)) is not None:
             self.rpdo_ns = t_ns
-            self._take(frame.data)
+            self._take(number, frame.data)
         else:
             self.wire.notify(frame.id, bytearray(frame.data), t_ns * 1e-9)
             if frame.id == 0x600 + self.node_id:
@@ -177,11 +177,20 @@ class MakerDrive:
                 data += self.node.get_data(entry >> 16, entry >> 8 & 0xFF)
             self.wire.send_message(cob_id & 0x7FF, data)
 
-    def _take(self, data: bytes) -> None:
-        for sub in range(1, self.get(0x1600) + 1):
-            entry = self.get(0x1600, sub)
+    def _received(self, can_id: int) -> int | None:
+        """Number of the RPDO with this COB-ID, if it is on."""
+        for number in range(4):
+            cob_id = self.get(0x1400 + number, 1)
+            if self.has(0x1400 + number, 1) and cob_id & 0x7FF == can_id and not cob_id >> 31:
+                return number
+        return None
+
+    def _take(self, number: int, data: bytes) -> None:
+        for sub in range(1, self.get(0x1600 + number) + 1):
+            entry = self.get(0x1600 + number, sub)
             size = (entry & 0xFF) // 8
-            self.node.set_data(entry >> 16, entry >> 8 & 0xFF, data[:size])
+            if entry >> 16 >= 0x20:  # those below are dummies
+                self.node.set_data(entry >> 16, entry >> 8 & 0xFF, data[:size])
             data = data[size:]
         assert not data
         self._control(self.get(0x6040))

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from stereoservo_drivers.can.frames import CanFrame
-from stereoservo_drivers.canopen.cia402 import Cia402Codec, tpdo_feedback, tpdo_mappings
+from stereoservo_drivers.canopen.cia402 import Cia402Codec
 from stereoservo_drivers.canopen.codec import NOT_CYCLIC
 from stereoservo_drivers.canopen.options import CanJoint, CanOptions
 
@@ -54,24 +54,6 @@ def enabled() -> Cia402Codec:
 
 
 # -- process data -----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("feedback", "pdos"),
-    [
-        ((), ()),
-        (("velocity",), (("velocity",),)),
-        (("velocity", "effort"), (("velocity", "effort"),)),
-        (("velocity", "following_error"), (("velocity", "following_error"),)),
-        (("velocity", "effort", "following_error"), (("velocity", "effort"), ("following_error",))),
-        (("velocity", "following_error", "effort"), (("velocity", "following_error"), ("effort",))),
-    ],
-)
-def test_feedback_fills_pdos_in_its_order(feedback: tuple[str, ...], pdos: tuple[tuple[str, ...], ...]) -> None:
-    assert tpdo_feedback(feedback) == pdos
-    for mapping in tpdo_mappings(feedback):
-        assert sum(entry & 0xFF for entry in mapping) <= 64
-    assert codec_of(feedback=feedback).expected == (1 << 2 * (1 + len(pdos))) - 1
 
 
 def test_bits_are_named_after_node_and_pdo() -> None:

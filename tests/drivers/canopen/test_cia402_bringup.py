@@ -384,7 +384,7 @@ def test_drives_without_consumer_heartbeat_are_guarded_and_stop_when_the_guardin
 
 
 def test_an_object_that_neither_eds_nor_standard_know_is_refused(make_bench: Make) -> None:
-    message = make_bench(make_options(make_joint(1, sdo={"0x2345:1": 5}))).refused("wrong_eds")
+    message = make_bench(make_options(make_joint(1, sdo={"0x2345:1": 5}))).refused("sdo_abort")
     assert "0x2345:1" in message
     assert "option sdo" in message
 
@@ -432,7 +432,7 @@ def test_sdo_aborts_name_node_object_value_and_option(make_bench: Make) -> None:
 @pytest.mark.parametrize(
     ("sdo", "code", "part"),
     [
-        ({"0x2000:1": 5}, "wrong_eds", "0x2000:1"),
+        ({"0x2000:1": 5}, "sdo_abort", "0x2000:1"),
         ({"0x60C2:1": 256}, "option", "0 to 255"),
         ({"0x6007:0": 7}, "option", "0 to 3"),
     ],

@@ -8,6 +8,7 @@ import math
 import os
 from pathlib import Path
 
+import canopen
 import numpy as np
 import pytest
 
@@ -246,6 +247,111 @@ def test_switches_are_taken_from_the_drives_that_have_them():
     assert master.fault is None
     assert [axis.switches for axis in codec.axes] == [None, 2]
     assert ["0x60FD" in bringup.setups[node].safety() for node in (5, 6)] == [True, False]
+
+
+# -- process data that a drive restricts ---------------------------------------------------------------------------
+
+
+def pdo_bench(entries: int, *, pdos: int = 4, **options: object) -> Bench:
+    """A drive with so many PDOs in each direction, of so many mapping entries each."""
+    bench = Bench(SHIPPED_EDS, (9,), **options)  # type: ignore[arg-type]
+    dictionary = bench.drive.node.object_dictionary
+    for base in (0x1400, 0x1800):
+        for number in range(4):
+            mapping = dictionary[base + 0x200 + number]
+            for sub in [sub for sub in mapping if sub > entries]:
+                del mapping.subindices[sub]
+            if number >= pdos:
+                del dictionary.indices[base + number], dictionary.indices[base + 0x200 + number]
+    return bench
+
+
+def fix(bench: Bench, index: int, *mapping: int) -> None:
+    """Give a PDO of the drive a mapping that cannot be changed."""
+    for sub, value in enumerate((len(mapping), *mapping)):
+        bench.drive.put(index, sub, value)
+    for variable in bench.drive.node.object_dictionary[index].values():
+        variable.access_type = "ro"
+
+
+def moves_as_commanded(bench: Bench) -> None:
+    bench.run()
+    start = bench.position
+    bench.go(TRAVEL / SPEED, SPEED)
+    bench.go(0.5)
+    assert bench.master.fault is None
+    assert bench.position - start == pytest.approx(TRAVEL, rel=0.01)
+    sample = bench.master.sample()
+    assert sample is not None
+    assert sample.positions[0] == pytest.approx(bench.position, abs=2 / COUNTS_PER_RAD)
+
+
+@pytest.mark.parametrize("entries", [1, 2, 3, 8])
+def test_process_data_are_spread_over_as_many_pdos_as_a_drive_needs(entries):
+    bench = pdo_bench(entries)
+    moves_as_commanded(bench)
+    counts = [bench.drive.get(0x1A00 + n) * (not bench.drive.get(0x1800 + n, 1) >> 31) for n in range(4)]
+    assert counts == ([1, 1, 1, 1] if entries == 1 else [2, 2, 0, 0])
+    sample = bench.master.sample()
+    assert sample is not None
+    assert sample.efforts is not None
+    assert bench.bringup.setups[5].losses == ()
+
+
+def test_feedback_without_a_place_is_left_out_and_reported():
+    bench = pdo_bench(1, pdos=3)
+    moves_as_commanded(bench)
+    assert bench.bringup.setups[5].losses == ("effort is not sent: the drive's TPDOs have no place for it",)
+    sample = bench.master.sample()
+    assert sample is not None
+    assert sample.efforts is None
+
+
+def test_a_drive_without_place_for_its_set_point_is_refused_with_what_it_refused():
+    bench = pdo_bench(1, pdos=1)
+    with pytest.raises(DriverError, match=r"PDOs cannot carry control word and set-point.*0x1401:1.*does not exist") as e:
+        bench.run()
+    assert e.value.code == "no_pdos"
+
+
+def test_an_object_that_cannot_be_mapped_is_left_out():
+    bench = Bench(SHIPPED_EDS, (9,))
+
+    def refuse(index: int, subindex: int, od: object, data: bytes) -> None:
+        if 0x1A00 <= index < 0x1A04 and int.from_bytes(data, "little") == 0x60770010:
+            raise canopen.SdoAbortedError(0x06040041)
+
+    bench.drive.node.add_write_callback(refuse)
+    moves_as_commanded(bench)
+    assert any("effort is not sent" in text for text in bench.bringup.setups[5].losses)
+
+
+def test_mappings_that_cannot_be_changed_are_used_and_what_else_they_hold_stays():
+    bench = Bench(SHIPPED_EDS, (9,))
+    fix(bench, 0x1600, 0x60400010)
+    fix(bench, 0x1601, 0x60400010, 0x60600008)
+    fix(bench, 0x1602, 0x60400010, 0x00050008, 0x60FF0020)
+    fix(bench, 0x1A00, 0x60410010)
+    fix(bench, 0x1A01, 0x60410010, 0x60610008, 0x60640020)
+    moves_as_commanded(bench)
+    on = [number for number in range(4) if not bench.drive.get(0x1400 + number, 1) >> 31]
+    assert on == [2], "the one that holds both, beside a dummy"
+    other = Bench(SHIPPED_EDS, (9,))
+    for index, mapping in ((0x1600, (0x60400010,)), (0x1601, (0x60FF0020, 0x60600008)), (0x1602, ()), (0x1603, ())):
+        fix(other, index, *mapping)
+    moves_as_commanded(other)
+    assert other.drive.get(0x6060) == 9, "the mode in the PDO is the one that was set"
+
+
+@pytest.mark.parametrize(("value", "words"), [(0, "lets its axis run out"), (1, "is fixed at 1: 2 was to be written")])
+def test_an_object_that_cannot_be_changed_is_a_loss_whatever_the_eds_says(value, words):
+    """The shipped EDS, which describes the object as writable, is what the master knows."""
+    bench = Bench(SHIPPED_EDS, (9,))
+    bench.drive.put(0x605E, 0, value)
+    bench.drive.node.object_dictionary[0x605E].access_type = "ro"
+    bench.run()
+    assert words in bench.bringup.setups[5].safety()
+    assert bench.drive.get(0x605E) == value
 
 
 def output_bench(name: str = "valve", bit: int = 16, **changes: object) -> Bench:
