@@ -442,7 +442,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
             outermost = np.where(towards > 0.0, np.maximum(step.positions, ahead), np.minimum(step.positions, ahead))
         command(block.record, record, limits.keep_outs)
         context = SimpleNamespace(
-            derived=SimpleNamespace(room=SimpleNamespace(numbers=work, arrays=arrays)),
+            derived=SimpleNamespace(workspace=SimpleNamespace(numbers=work, arrays=arrays)),
             state=SimpleNamespace(block=block), now_ns=now_ns, dt_s=step.dt_s,
         )  # fmt: skip
         result = stage.limited_command(context, limits)

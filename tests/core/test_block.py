@@ -52,7 +52,7 @@ def test_a_block_is_read_as_it_was_written_and_anything_else_refused() -> None:
 def test_what_a_goal_keeps_of_a_step_does_not_change_with_the_next(bench: Any) -> None:
     bench.ready()
     place = place_now(bench.core._context)
-    room = bench.core._derived.room.prediction
-    np.testing.assert_array_equal(place.operators, room.operators)
+    workspace = bench.core._derived.workspace.prediction
+    np.testing.assert_array_equal(place.operators, workspace.operators)
     for kept in (place.operators, place.points):
-        assert not any(np.shares_memory(kept, array) for array in (room.operators, room.points))
+        assert not any(np.shares_memory(kept, array) for array in (workspace.operators, workspace.points))

@@ -31,14 +31,14 @@ from stereoservo.numerics.compilation import kernel
 
 
 @kernel
-def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
+def command(block: Record, workspace: Record, keep_outs: FloatArray) -> None:
     """Stage 6: compute the ``command`` (n,) of the block from the ``velocity`` (n,) of the motion in the workspace
-    ``room``; zero if the drives are not active.
+    ``workspace``; zero if the drives are not active.
 
     Also written to the workspace: ``limited``, whether there is anything to report about the command; ``result``, the
     values that recordings keep, where the error is that of a law's kernel.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n = memory.joints
     sent, velocity, raw = memory.command[:n], work.velocity[:n], work.raw[:n]
     if work.rests != 0:
@@ -51,10 +51,10 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
     work.added = 0
     if work.compensates != 0:
         looks = work.joints_found == TAKEN and (work.needs_features == 0 or feature_age_s <= work.bounds[FRESH])
-        work.added = int(add_friction(block, room, looks))
+        work.added = int(add_friction(block, workspace, looks))
     if work.added == 0:
         raw[:] = velocity
-    _foresee(block, room)
+    _foresee(block, workspace)
     work.previous[:n] = sent
     limits = Bounds(work.limits[: 4 * n].reshape((4, n)), work.bounds, keep_outs)
     wanted = Wanted(
@@ -75,12 +75,12 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
 
 
 @kernel
-def _foresee(block: Record, room: Record) -> None:
-    """Write to ``outermost`` (n,) of the workspace ``room`` the extreme position of each joint in its direction of
+def _foresee(block: Record, workspace: Record) -> None:
+    """Write to ``outermost`` (n,) of the ``workspace`` the extreme position of each joint in its direction of
     motion: the current position, or for a late drive the position that the joint reaches before it executes the
     velocity.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     for j in range(memory.joints):
         q, velocity = work.q[j], work.raw[j]
         work.outermost[j] = q
@@ -129,14 +129,14 @@ def friction_bounds(
 
 
 @kernel
-def add_friction(block: Record, room: Record, looks: bool) -> bool:
-    """Write to ``raw`` (n,) of the workspace ``room`` the motion's ``velocity`` (n,) plus the friction compensation;
+def add_friction(block: Record, workspace: Record, looks: bool) -> bool:
+    """Write to ``raw`` (n,) of the ``workspace`` the motion's ``velocity`` (n,) plus the friction compensation;
     returns whether there is any compensation. Zero remains zero: a joint that shall not move is not compensated.
 
     If ``looks`` is True, the commanded travel, at the time of its arrival, is compared with the measured travel once it
     is large enough. The comparison restarts when the direction reverses.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s, q = memory.joints, work.dt_s, work.q[: memory.joints]
     wanted, velocity, most, travel = (
         work.velocity[:n],
@@ -344,8 +344,8 @@ def explained(
 
 def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
     """The safety stage's result for this step's motion, with its reasons."""
-    room, block = context.derived.room, context.state.block
-    work, given = room.numbers, room.arrays
+    workspace, block = context.derived.workspace, context.state.block
+    work, given = workspace.numbers, workspace.arrays
     raw, command = given["raw"].copy(), block.command.copy()
     if not work.limited:
         return SafetyResult(raw, command)
@@ -533,14 +533,14 @@ def _position_caps(
                 if above:
                     if math.isinf(keep_outs[k, j, 1]):
                         continue
-                    room = behind[j] - (keep_outs[k, j, 1] + margin)
+                    clearance = behind[j] - (keep_outs[k, j, 1] + margin)
                     speed = max(0.0, -previous[j])
                 else:
                     if math.isinf(keep_outs[k, j, 0]):
                         continue
-                    room = keep_outs[k, j, 0] - margin - ahead[j]
+                    clearance = keep_outs[k, j, 0] - margin - ahead[j]
                     speed = max(0.0, previous[j])
-                slack = (room - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
+                slack = (clearance - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
                 if slack > best_slack:
                     best, best_above, best_slack = j, above, slack
         if best < 0:

@@ -383,7 +383,7 @@ class Derived:
     ``look_every``: steps between two examinations of why a law is slow or stuck.
     ``laws``: the installed laws, by name.
     ``cameras``: indices by name.
-    ``room``: the workspace of the kernels, with the constants that they take.
+    ``workspace``: the workspace of the kernels, with the constants that they take.
     ``load_limits``: collision thresholds of efforts and following errors, (n,) each; None: collisions are not
     monitored.
     """
@@ -396,7 +396,7 @@ class Derived:
     look_every: int
     laws: Mapping[str, Law]
     cameras: Mapping[str, int]
-    room: Workspace
+    workspace: Workspace
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
@@ -409,7 +409,7 @@ class Derived:
     def use(self, arrays: ModelArrays) -> None:
         """Use a model from now on."""
         self.arrays = arrays
-        self.room.use(arrays)
+        self.workspace.use(arrays)
 
 
 class Ingested(msgspec.Struct, frozen=True, eq=False):
@@ -482,7 +482,7 @@ class StepContext:
     def q(self) -> FloatArray:
         """The measured joint positions (n,), valid for this step only."""
         if self._q is None:
-            self._q = self.derived.room.q.copy()
+            self._q = self.derived.workspace.q.copy()
         return self._q
 
     @property
@@ -493,7 +493,7 @@ class StepContext:
     @property
     def paused(self) -> bool:
         """Whether the active source has to wait in this step."""
-        return bool(self.derived.room.numbers.paused)
+        return bool(self.derived.workspace.numbers.paused)
 
 
 class Finding(msgspec.Struct, frozen=True):

@@ -56,36 +56,36 @@ AT_REST = 1e-3
 
 
 @kernel
-def estimate(block: Record, room: Record) -> None:
-    """Stage 2: update the cameras' estimates by the accepted frames in the workspace ``room``, except those that Python
+def estimate(block: Record, workspace: Record) -> None:
+    """Stage 2: update the cameras' estimates by the accepted frames in the ``workspace``, except those that Python
     processes (`take_frames_apart`); then predict the current markers.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     if work.frames_as_stops == 0:
         for c in range(memory.cameras):
             memory.sightings[c].fresh = False
         for k in range(work.frames):
             if work.arrived_found[k] == TAKEN:
-                take_frame(block, room, k)
+                take_frame(block, workspace, k)
     if memory.history_count > 0:
-        present(block, room)
+        present(block, workspace)
 
 
 @kernel
-def note_frames(block: Record, room: Record) -> None:
+def note_frames(block: Record, workspace: Record) -> None:
     """Stage 2 of a cell without a model: store sequence number and number of markers of each accepted frame."""
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     for c in range(memory.cameras):
         memory.sightings[c].fresh = False
     for k in range(work.frames):
         if work.arrived_found[k] == TAKEN:
-            note_frame(block, room, k)
+            note_frame(block, workspace, k)
 
 
 @kernel
-def note_frame(block: Record, room: Record, k: int) -> None:
-    """Store frame ``k`` in the workspace ``room`` as the newest one of its camera."""
-    work = room[0]
+def note_frame(block: Record, workspace: Record, k: int) -> None:
+    """Store frame ``k`` in the ``workspace`` as the newest one of its camera."""
+    work = workspace[0]
     estimate = block[0].estimates[work.arrived_camera[k]]
     estimate.last_seq, estimate.last_visible = work.arrived_seq[k], work.arrived_count[k]
 
@@ -94,10 +94,10 @@ def take_frames_apart(context: StepContext) -> None:
     """Process the frames of a cell with cameras that may move or with a target that is followed. Python processes them
     one by one; `estimate` then processes none.
     """
-    state, room = context.state, context.derived.room
+    state, workspace = context.state, context.derived.workspace
     for sighting in state.watching.sightings:
         sighting.fresh = False
-    found = room.arrays["arrived_found"]
+    found = workspace.arrays["arrived_found"]
     for k, observation in enumerate(newest_frames(context.inputs)):
         if found[k] == TAKEN:
             camera = context.derived.cameras[observation.camera]
@@ -110,15 +110,15 @@ def take_frames_apart(context: StepContext) -> None:
 
 def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> None:
     """Process a frame like `take_frame`, and check whether the camera moves."""
-    state, room = context.state, context.derived.room
+    state, workspace = context.state, context.derived.workspace
     if context.derived.arrays is None:
-        note_frame(state.block.record, room.record, k)
+        note_frame(state.block.record, workspace.record, k)
         return
-    found = see_frame(state.block.record, room.record, k)
+    found = see_frame(state.block.record, workspace.record, k)
     if found & TOLD:  # the arm's position is measured, not only predicted
         _look_for_motion(camera, t_ns, context)
-    room.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
-    fold_frame(state.block.record, room.record, k, found)
+    workspace.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
+    fold_frame(state.block.record, workspace.record, k, found)
 
 
 # -- the model ----------------------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     start_model_monitor(state, arrays, settings, masked)
     state.model = model
     loads = context.derived.load_limits = load_limits(settings, model)
-    context.derived.room.limit_loads(loads)
+    context.derived.workspace.limit_loads(loads)
     state.readiness, state.comparison = fitted_readiness(model), None
     offsets = stated_offsets(model)
     state.cameras = [CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras]
@@ -229,12 +229,12 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 
 def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
     """Check whether a mobile camera moves; while it does, its newest frame is not compared with the prediction."""
-    state, room, arrays = context.state, context.derived.room, context.derived.arrays
+    state, workspace, arrays = context.state, context.derived.workspace, context.derived.arrays
     if state.mobile[camera] is None or arrays is None:
         return
-    residuals = room.residuals(t_ns)
+    residuals = workspace.residuals(t_ns)
     residuals.seen[:] = moving_camera.see(
-        state, context.settings, arrays, camera, residuals, room.of_frame, room.frame_q, context.emit
+        state, context.settings, arrays, camera, residuals, workspace.of_frame, workspace.frame_q, context.emit
     ).seen
 
 
@@ -281,11 +281,11 @@ def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, in
 
 
 @kernel
-def _follow_offset(block: Record, room: Record, k: int) -> None:
+def _follow_offset(block: Record, workspace: Record, k: int) -> None:
     """Correct the offset of a camera's stamps by the motion of its markers, within a bound: see `offset_rules`. The
     corrected shutter time is not later than the arrival of frame ``k``.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     camera = work.arrived_camera[k]
     rule, stated = work.offset_rule[camera], work.stated_offset_ns[camera]
     estimate, timing = memory.estimates[camera], memory.sightings[camera].timing
@@ -330,24 +330,24 @@ KNOWN, TOLD = 1, 2
 
 
 @kernel
-def take_frame(block: Record, room: Record, k: int) -> None:
-    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time, and update the estimate of
+def take_frame(block: Record, workspace: Record, k: int) -> None:
+    """Compare frame ``k`` in the ``workspace`` with the prediction at its shutter time, and update the estimate of
     its camera.
     """
-    fold_frame(block, room, k, see_frame(block, room, k))
+    fold_frame(block, workspace, k, see_frame(block, workspace, k))
 
 
 @kernel
-def see_frame(block: Record, room: Record, k: int) -> int:
-    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time and write the residuals to
+def see_frame(block: Record, workspace: Record, k: int) -> int:
+    """Compare frame ``k`` in the ``workspace`` with the prediction at its shutter time and write the residuals to
     the workspace. Returns bits: `KNOWN` if the joints are known at that time, `TOLD` if there are samples on both sides
     of it.
 
     For a frame newer than the last joint sample, the current joint velocities are used. Observations that the camera's
     lens cannot produce are ignored.
     """
-    note_frame(block, room, k)
-    memory, work = block[0], room[0]
+    note_frame(block, workspace, k)
+    memory, work = block[0], workspace[0]
     camera, count = work.arrived_camera[k], work.arrived_count[k]
     n, m, rows, lens_size = memory.joints, memory.markers, memory.rows, work.lens_size
     shutter_ns = work.arrived_ns[k] + memory.estimates[camera].offset_ns
@@ -363,7 +363,7 @@ def see_frame(block: Record, room: Record, k: int) -> int:
         work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
     )
     predict_into(
-        arm_of(room),
+        arm_of(workspace),
         q,
         work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
         Predicted(
@@ -382,7 +382,7 @@ def see_frame(block: Record, room: Record, k: int) -> int:
                 row[i] = -1
     standing = 2 * rows * camera
     _compare(
-        room,
+        workspace,
         Observations(row, pixels, covariances),
         predicted[0],
         work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
@@ -393,27 +393,27 @@ def see_frame(block: Record, room: Record, k: int) -> int:
 
 
 @kernel
-def fold_frame(block: Record, room: Record, k: int, found: int) -> None:
-    """Pass the residuals of frame ``k`` in the workspace ``room`` on; ``found`` is the result of `see_frame`. The
+def fold_frame(block: Record, workspace: Record, k: int, found: int) -> None:
+    """Pass the residuals of frame ``k`` in the ``workspace`` on; ``found`` is the result of `see_frame`. The
     monitors receive them if the joints were sampled on both sides of the shutter time. The camera's estimate is updated
     if the camera's pose is known. Nothing happens if the joints are unknown.
     """
-    work = room[0]
+    work = workspace[0]
     if found & KNOWN == 0:
         return
     if found & TOLD:
-        fold_residuals(block, room, k)
-        _follow_offset(block, room, k)
+        fold_residuals(block, workspace, k)
+        _follow_offset(block, workspace, k)
     if work.unknown[work.arrived_camera[k]] == 0:
-        accept_sights(block, room, k)
+        accept_sights(block, workspace, k)
 
 
 @kernel
-def fold_residuals(block: Record, room: Record, k: int) -> None:
-    """Store the residuals of frame ``k`` in the workspace ``room`` as the newest ones of its camera. A round becomes
+def fold_residuals(block: Record, workspace: Record, k: int) -> None:
+    """Store the residuals of frame ``k`` in the ``workspace`` as the newest ones of its camera. A round becomes
     due if no round has examined the frame before it.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, rows, m = memory.joints, memory.rows, memory.markers
     camera, t_ns = work.arrived_camera[k], work.arrived_ns[k]
     frame = memory.sightings[camera]
@@ -499,23 +499,23 @@ def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, flo
 
 
 @kernel
-def accept_sights(block: Record, room: Record, k: int) -> None:
-    """Gate frame ``k``, whose residuals are in the workspace ``room``, and update the estimate of its camera. Masked
+def accept_sights(block: Record, workspace: Record, k: int) -> None:
+    """Gate frame ``k``, whose residuals are in the ``workspace``, and update the estimate of its camera. Masked
     markers are ignored.
 
     The gate is a chi-square test with two degrees of freedom on the deviation from the filtered innovation and its
     common change (see `_common_change`), with the covariances of detector, timing and model. An observation near the
     gate has a smaller weight in the filter, and a larger sigma in triangulation.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, camera = memory.markers, work.arrived_camera[k]
     used = np.empty(m, np.bool_)
     for i in range(m):
         used[i] = work.frame_seen[i] != 0 and work.masked[i] == 0.0
     common = np.zeros((m, 2))
     if work.erring:
-        _common_change(block, room, camera, used, common)
-    accepted, rejected, squares = _fold_in(block, room, k, used, common)
+        _common_change(block, workspace, camera, used, common)
+    accepted, rejected, squares = _fold_in(block, workspace, k, used, common)
     estimate = memory.estimates[camera]
     estimate.last_visible = accepted
     estimate.frames += 1
@@ -532,7 +532,7 @@ COMMON_ROUNDS = 8
 
 
 @kernel
-def _common_change(block: Record, room: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
+def _common_change(block: Record, workspace: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
     """Write the common change of the innovations to ``common`` (m, 2) [px]: the change since the filtered ones that is
     explained by joints passing through their play or a step, within the errors of joint readings that the model states.
     Zeros if nothing changed.
@@ -540,7 +540,7 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
     ``used`` (m,): markers to use. Huber's weights are iterated: a common change moves all markers, an outlier moves
     one.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, n, at = memory.markers, memory.joints, memory.markers * camera
     filtered, seen_ns = (
         memory.innovation[2 * at : 2 * (at + m)].reshape((m, 2)),
@@ -605,20 +605,20 @@ class Observations(NamedTuple):
 
 @kernel
 def _compare(
-    room: Record,
+    workspace: Record,
     observations: Observations,
     predicted: FloatArray,
     standing: FloatArray,
     jacobian: FloatArray,
     speed: FloatArray,
 ) -> None:
-    """Write the fields of `FrameResiduals` to the workspace ``room``: observed minus predicted pixels [px].
+    """Write the fields of `FrameResiduals` to the ``workspace``: observed minus predicted pixels [px].
 
     ``predicted`` (m, 2), ``standing`` (s, 2): predicted pixels of markers and of static points.
     ``jacobian`` (m, 2, n), ``speed`` (n,): give the pixel velocities; a shutter stamp that is off by `TIMING_SIGMA_S`
     adds to the covariance by them.
     """
-    work, markers, n = room[0], jacobian.shape[0], jacobian.shape[2]
+    work, markers, n = workspace[0], jacobian.shape[0], jacobian.shape[2]
     rows, pixels, covariances = observations
     count = markers + standing.shape[0]
     innovation, spread = (
@@ -649,7 +649,7 @@ def _compare(
 
 
 @kernel
-def _fold_in(block: Record, room: Record, k: int, used: BoolArray, common: FloatArray) -> tuple[int, int, float]:
+def _fold_in(block: Record, workspace: Record, k: int, used: BoolArray, common: FloatArray) -> tuple[int, int, float]:
     """Update the filtered innovations by those of frame ``k``, each by its weight; rejected ones change nothing.
     Returns the numbers of accepted and rejected innovations, and the sum of squares of the accepted ones [px²].
 
@@ -659,7 +659,7 @@ def _fold_in(block: Record, room: Record, k: int, used: BoolArray, common: Float
     The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SIGHT_SIGMA_PX` for markers that
     were not seen recently.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, t_ns = memory.markers, work.arrived_ns[k]
     at, end = m * work.arrived_camera[k], m * (work.arrived_camera[k] + 1)
     innovation, spread = (

@@ -106,9 +106,9 @@ def arm_in(arrays: ModelArrays) -> Arm:
 
 
 @inlined_kernel
-def arm_of(room: Record) -> Arm:
-    """The arm of the model in the workspace ``room``."""
-    work = room[0]
+def arm_of(workspace: Record) -> Arm:
+    """The arm of the model in the ``workspace``."""
+    work = workspace[0]
     n, m = work.joints, work.markers
     return Arm(
         work.generators[: 16 * n].reshape((n, 4, 4)),
@@ -294,10 +294,10 @@ FURTHER_STEPS = 3
 
 
 @kernel
-def present(block: Record, room: Record) -> None:
+def present(block: Record, workspace: Record) -> None:
     """Estimate the current markers.
 
-    Written to the workspace ``room``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
+    Written to the ``workspace``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
     1/sigma [1/px] of recently seen markers, 0 for others; ``pixels`` (c, m, 2), the current markers: prediction plus
     held innovation. Written to the ``block``: the ``correction`` (n,) of the joints that explains the innovations best,
     so that the corrected points remain those of a rigid body.
@@ -305,9 +305,9 @@ def present(block: Record, room: Record) -> None:
     The correction is one Gauss-Newton step. If it is large (arms with play), further steps follow as long as they
     reduce the residual.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, cameras, markers = memory.joints, memory.cameras, memory.markers
-    arm, q = arm_of(room), work.q[:n]
+    arm, q = arm_of(workspace), work.q[:n]
     matrices = work.matrices[: 12 * cameras].reshape((cameras, 3, 4))
     innovation = memory.innovation[: 2 * cameras * markers].reshape((cameras, markers, 2))
     sigma, seen_ns = memory.sigma[: cameras * markers], memory.seen_ns[: cameras * markers]

@@ -40,11 +40,11 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
     """
     state, output = context.state, context.output
     if output is not None:
-        context.derived.room.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
+        context.derived.workspace.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
         if output.finished:
             finish(output, context)
     state.step += 1
-    if state.step % context.derived.look_every or not context.derived.room.numbers.runs:
+    if state.step % context.derived.look_every or not context.derived.workspace.numbers.runs:
         return
     source = state.source
     examine = MOTION_SOURCES[type(source)].examine
@@ -87,7 +87,7 @@ def motion_of(context: StepContext) -> SourceOutput:
     if context.output is not None:
         return context.output
     source = context.state.source
-    if isinstance(source, ServoGoal) and not context.derived.room.numbers.rests:
+    if isinstance(source, ServoGoal) and not context.derived.workspace.numbers.rests:
         return found_by_kernel(source, context)
     return NO_MOTION
 
@@ -114,7 +114,7 @@ def _reasons_before(context: StepContext, limited: SafetyResult) -> list[Reason]
 def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
     """All reasons: those ``found`` before, and those of the last examination of a law's run."""
     state = context.state
-    if context.derived.room.numbers.runs and isinstance(state.source, LawRun):
+    if context.derived.workspace.numbers.runs and isinstance(state.source, LawRun):
         codes = {reason.code for reason in found}
         found.extend([reason for reason in state.source.reasons if reason.code not in codes])
     if state.planning is not None:
@@ -248,14 +248,19 @@ def priors(
     Earlier observations of cameras that are ``moving`` are not used. Cameras whose pose is ``unknown`` have no prior:
     their detectors search the whole image.
     """
-    state, room, now_ns = context.state, context.derived.room, context.now_ns
+    state, workspace, now_ns = context.state, context.derived.workspace, context.now_ns
     shape = prediction.pixels.shape
     expected = Expected(np.empty(shape), np.empty(shape), np.empty((*shape, 2)))
     pixels, speed, covariance = expected
     if arrays.joint_accuracy is not None:
-        room.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
+        workspace.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
     beyond = expect_sights(
-        state.block.record, room.record, prediction.pixels, prediction.jacobian, sum([1 << c for c in moving]), expected
+        state.block.record,
+        workspace.record,
+        prediction.pixels,
+        prediction.jacobian,
+        sum([1 << c for c in moving]),
+        expected,
     )
     found = []
     for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
@@ -287,7 +292,7 @@ class Expected(NamedTuple):
 
 @kernel
 def expect_sights(
-    block: Record, room: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
+    block: Record, workspace: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
 ) -> int:
     """Write the expected observations of all cameras to ``expected``, distorted by their lenses: ``predicted`` (c, m,
     2) pixels with their ``jacobian`` (c, m, 2, n), plus the innovations of recently seen markers. Returns a bit mask of
@@ -296,7 +301,7 @@ def expect_sights(
 
     Cameras whose bits are set in ``moving`` have no recent observations.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, m, lens_size = memory.joints, memory.markers, work.lens_size
     beyond = 0
     for c in range(memory.cameras):

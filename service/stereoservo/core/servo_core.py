@@ -75,8 +75,8 @@ def observe(context: StepContext, *, decides: bool) -> int:
     ``decides`` or anything was detected, the active goal may change, so its law measures the progress itself.
     """
     derived = context.derived
-    room, block = derived.room, context.state.block
-    work, record, space = room.numbers, block.record, room.record
+    workspace, block = derived.workspace, context.state.block
+    work, record, space = workspace.numbers, block.record, workspace.record
     found = ingest(record, space)
     if work.frames_as_stops:
         take_frames_apart(context)
@@ -86,7 +86,11 @@ def observe(context: StepContext, *, decides: bool) -> int:
         estimate(record, space)
         if block.numbers.history_count:
             context.arrays = context.moved_arrays or derived.arrays
-            context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
+            context.prediction, context.weights, context.pixels = (
+                workspace.prediction,
+                workspace.weights,
+                workspace.pixels,
+            )
     found |= detect(record, space)
     context.goes_on = bool(work.aims) and not found and not decides and follow_goal(record, space)
     return found
@@ -138,12 +142,12 @@ class NewestStep:
     @property
     def raw(self) -> FloatArray:
         """Velocity (n,) before the safety stage."""
-        return self._context.derived.room.raw
+        return self._context.derived.workspace.raw
 
     @property
     def values(self) -> FloatArray:
         """As in `core.cycle.StepResult`."""
-        return self._context.derived.room.result
+        return self._context.derived.workspace.result
 
     @property
     def priors(self) -> tuple[Prior, ...]:
@@ -174,7 +178,7 @@ class ServoCore:
             features_fresh_s=fresh_s,
             laws=LAWS.usable(),
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
-            room=workspace(settings, model),
+            workspace=workspace(settings, model),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
             look_every=max(1, round(settings.rate_hz * LOOK_EVERY_S)),
             load_limits=load_limits(settings, model),
@@ -192,8 +196,8 @@ class ServoCore:
 
     def _put_limits(self) -> None:
         """Write the limits of the safety stage and the longest ages of inputs into the workspace."""
-        derived, given = self._derived, self._derived.room.arrays
-        work, limits = derived.room.numbers, self._limits
+        derived, given = self._derived, self._derived.workspace.arrays
+        work, limits = derived.workspace.numbers, self._limits
         given["limits"][:], given["bounds"][:] = limits.table, limits.bounds
         work.nominal_s, work.longest_gap_s = derived.nominal_period_ns * 1e-9, derived.longest_gap_s
         work.frame_timeout_s = derived.frame_timeout_s
@@ -222,15 +226,15 @@ class ServoCore:
         if context.ingested is NOTHING and not isinstance(state.source, BY_KERNELS):
             context.ingested = account_inputs(context)
         move(context)
-        room = self._derived.room
-        command(state.block.record, room.record, self._limits.keep_outs)
+        workspace = self._derived.workspace
+        command(state.block.record, workspace.record, self._limits.keep_outs)
         finish_step(context, self._limits)
         if context.output is not None:  # Python has moved the arm, and may have changed any state
             self._arranged = None
 
     def _prepare(self, context: StepContext) -> None:
         """Prepare a step: update the driver's lifecycle, and put a pending model in use."""
-        state, inputs, work = context.state, context.inputs, self._derived.room.numbers
+        state, inputs, work = context.state, context.inputs, self._derived.workspace.numbers
         if state.source is not self._arranged:
             self._arrange(context)
         work.active_before = work.active
@@ -267,8 +271,8 @@ FAULTY = (Lifecycle.FAULT, Lifecycle.UNCONFIGURED)
 def arrange(context: StepContext) -> None:
     """Write the state that holds until the next decision into the workspace."""
     state, settings, derived = context.state, context.settings, context.derived
-    room, watching, kind = derived.room, state.watching, MOTION_SOURCES[type(state.source)]
-    work, given = room.numbers, room.arrays
+    workspace, watching, kind = derived.workspace, state.watching, MOTION_SOURCES[type(state.source)]
+    work, given = workspace.numbers, workspace.arrays
     work.active, work.faulty = state.lifecycle is Lifecycle.ACTIVE, state.lifecycle in FAULTY
     work.stopped, work.by_images = state.stopped, kind.by_images
     work.learning = isinstance(state.source, TrialMotion)
@@ -294,7 +298,7 @@ def arrange(context: StepContext) -> None:
         and not work.paused
     )
     if work.aims and isinstance(source, ServoGoal):
-        aim_at(room, source)
+        aim_at(workspace, source)
     arrange_motion(context)
 
 

@@ -552,9 +552,9 @@ def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields,
 
 
 @kernel
-def fill_step(room: Record, count: int) -> None:
+def fill_step(workspace: Record, count: int) -> None:
     """Compute the step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
-    work = room[0]
+    work = workspace[0]
     n, m, c = work.joints, work.markers, work.eye_count
     arm = CurrentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
     task = BodyTask(
@@ -573,9 +573,9 @@ def fill_step(room: Record, count: int) -> None:
 
 
 @kernel
-def cartesian3_kernel(room: Record) -> None:
+def cartesian3_kernel(workspace: Record) -> None:
     """The law's ``kernel``."""
-    fill_step(room, 3)
+    fill_step(workspace, 3)
 
 
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:

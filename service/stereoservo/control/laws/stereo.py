@@ -199,9 +199,9 @@ def _image_step(operators: FloatArray, view: Fields, body: Fields, gains: Fields
 
 
 @kernel
-def image_kernel(room: Record) -> None:
+def image_kernel(workspace: Record) -> None:
     """`image_step` for static set-points, as the ``kernel`` of a law."""
-    work = room[0]
+    work = workspace[0]
     n, c, m = work.joints, work.cameras, work.markers
     view = View(
         work.matrices[: 12 * c].reshape((c, 3, 4)),

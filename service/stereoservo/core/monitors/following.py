@@ -94,11 +94,11 @@ def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tu
 
 
 @kernel
-def account_silence(block: Record, room: Record) -> None:
+def account_silence(block: Record, workspace: Record) -> None:
     """Add up the travel commanded to each joint, at the time of its arrival, and its duration, since the reading last
     changed, less the part that friction may hold back.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s = memory.joints, work.elapsed_s
     q, velocity, answers, friction = (
         work.q[:n],
@@ -215,14 +215,14 @@ def _median(samples: FloatArray) -> float:
 
 
 @kernel
-def account_travel(block: Record, room: Record, command: FloatArray, fresh: bool, delays: DriveDelays) -> None:
+def account_travel(block: Record, workspace: Record, command: FloatArray, fresh: bool, delays: DriveDelays) -> None:
     """Update the travel by the time since the last step at the velocities ``command`` (n,): without delay in the
     ``block``'s untold and missing travel, with delay in ``delays``.
 
     ``fresh``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
     delay is shorter; the shorter one is added to the samples.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s, step = memory.joints, work.elapsed_s, memory.delay_steps
     delay_s, samples, _, sent, past, velocity, under_way, accounted, missing_late = delays
     untold, missing, answers = memory.untold_travel[:n], memory.missing_travel[:n], work.answers[:n]

@@ -328,7 +328,7 @@ def _begin_joint(trials: CalibrationMotion, context: StepContext, settings: Tria
     trials.side, trials.k, trials.step, trials.count = 1, 0, 0.0, 0
     _at_base(trials)
     if _planned(trials, settings):
-        trials.reach = room(trials.joint, context.settings, settings)
+        trials.reach = available_range(trials.joint, context.settings, settings)
         return
     trials.step = float(2.0 * settings.range[trials.joint] / (settings.stops - 1))
     trials.count = settings.stops // 2
@@ -390,7 +390,7 @@ def _promising(trials: CalibrationMotion, context: StepContext, settings: TrialS
     """
     if trials.k == 0 or trials.count == 0:
         return trials.count > 0
-    most = room(trials.joint, context.settings, settings)[0 if trials.side > 0 else 1]
+    most = available_range(trials.joint, context.settings, settings)[0 if trials.side > 0 else 1]
     crowded = int(trials.stops[trials.joint]) >= MOST_STOPS * settings.stops
     if trials.k >= trials.count and (abs(offset) > most or crowded):
         return False
@@ -563,7 +563,7 @@ def probe_size(kind: JointKindName) -> float:
     return PROBE[kind]
 
 
-def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
+def available_range(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
     """Range (2,) of a joint upwards and downwards from its base: its limits, and a reasonable largest range."""
     limits = core.limits
     margin = limits.position_margin + 4.0 * core.arrival[joint]

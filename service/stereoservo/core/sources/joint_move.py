@@ -138,11 +138,11 @@ def _seconds(move: JointMove, limits: LimitSettings, start: FloatArray) -> float
 def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
     limits = context.settings.limits
     low, high = limits.position_min + limits.position_margin, limits.position_max - limits.position_margin
-    rooms = np.minimum(move.target - low, high - move.target)
-    start_rooms = np.minimum(context.q - low, high - context.q)
-    at_end = bool(rooms.min() <= start_rooms.min())
-    rooms = rooms if at_end else start_rooms
-    joint = int(rooms.argmin())
+    clearances = np.minimum(move.target - low, high - move.target)
+    start_clearances = np.minimum(context.q - low, high - context.q)
+    at_end = bool(clearances.min() <= start_clearances.min())
+    clearances = clearances if at_end else start_clearances
+    joint = int(clearances.argmin())
     value = float((move.target if at_end else context.q)[joint])
     upper = high[joint] - value < value - low[joint]
     return Approach(
@@ -150,7 +150,7 @@ def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
         context.settings.joint_names[joint],
         value,
         float((high if upper else low)[joint]),
-        float(rooms[joint]),
+        float(clearances[joint]),
         "rad or m",
         1.0 if at_end else 0.0,
     )

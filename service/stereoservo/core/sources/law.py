@@ -67,7 +67,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     in the workspace.
     """
     law = context.derived.laws[source.law]
-    if by_kernel(source, law) and context.weights is context.derived.room.weights:
+    if by_kernel(source, law) and context.weights is context.derived.workspace.weights:
         return _kernel_step(source, context)  # the estimate changes if a camera's pose is found
     waiting = wait_for_target(source, context)
     if waiting is not None:
@@ -126,12 +126,12 @@ def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None
     """`servo_step` by the kernel of a law; returns None while the goal is active, with its velocity in
     the workspace.
     """
-    room = context.derived.room
-    work = room.numbers
+    workspace = context.derived.workspace
+    work = workspace.numbers
     if not work.followed:  # the goal has just started, or the state was examined before
-        aim_at(room, source)
-        follow_goal(context.state.block.record, room.record)
-    found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
+        aim_at(workspace, source)
+        follow_goal(context.state.block.record, workspace.record)
+    found = Found(work.run_found, error_now(workspace), work.seen, work.markers_needed)
     ended = _ended(source, context, found, source.wanted)
     return drive(source, context) if ended is None else ended
 
@@ -140,37 +140,37 @@ def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     """Write the velocity of an active goal into the workspace by its law's kernel; returns None unless the kernel
     fails.
     """
-    room, law = context.derived.room, context.derived.laws[source.law]
+    workspace, law = context.derived.workspace, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
     assert law.kernel is not None
     try:
-        law.kernel(room.record)
+        law.kernel(workspace.record)
     except Exception as error:  # as for any law: the exception ends its goal, never the loop
-        return _law_failed(source, context, error_now(room), error)
+        return _law_failed(source, context, error_now(workspace), error)
     if source.damping != 0.0:
-        room.velocity[:] = damp(source, context, room.velocity)
-    if room.velocity.size > RIGID_FREEDOMS:
-        room.velocity += away_from_limits(context)
+        workspace.velocity[:] = damp(source, context, workspace.velocity)
+    if workspace.velocity.size > RIGID_FREEDOMS:
+        workspace.velocity += away_from_limits(context)
     return None
 
 
-def error_now(room: Workspace) -> float | None:
+def error_now(workspace: Workspace) -> float | None:
     """The error [px] of the goal in the workspace; None if none is measured."""
-    return room.numbers.error_px if room.numbers.measured else None
+    return workspace.numbers.error_px if workspace.numbers.measured else None
 
 
 def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
     """The output of the goal's law kernel in this step."""
-    room, law = context.derived.room, context.derived.laws[source.law]
-    step = _found_step(room, len(law.components))
+    workspace, law = context.derived.workspace, context.derived.laws[source.law]
+    step = _found_step(workspace, len(law.components))
     return SourceOutput(
         step.velocity,
         True,
         source.goal.speed_scale,
         False,
         False,
-        error_now(room),
+        error_now(workspace),
         step.error,
         law.reasons(step),
     )
@@ -185,7 +185,7 @@ def damp(source: LawRun, context: StepContext, velocity: FloatArray, expected: F
     return damped_velocity(velocity, expected, context.state.block.velocities, source.damping)
 
 
-def aim_at(room: Workspace, goal: ServoGoal) -> None:
+def aim_at(workspace: Workspace, goal: ServoGoal) -> None:
     """Copy a ``goal`` to the workspace for the law. A moving goal replaces its arrays and never writes into them, so
     they are compared by identity.
     """
@@ -194,13 +194,13 @@ def aim_at(room: Workspace, goal: ServoGoal) -> None:
         goal.centre_target, goal.pose_known, goal.gain_near, goal.gain_far, goal.gain_slope, goal.tolerance_px,
         goal.hold_frames, goal.time_limit_s, goal.jacobian,
     )  # fmt: skip
-    if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
+    if len(workspace.aim) == len(aim) and all(map(is_, aim, workspace.aim)):
         return
-    room.aim, room.faced, given = aim, None, room.arrays
+    workspace.aim, workspace.faced, given = aim, None, workspace.arrays
     for name in AIM:
         given[name][:] = getattr(goal, name)
     given["target_known"][:] = goal.pose_known
-    numbers = room.numbers
+    numbers = workspace.numbers
     numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
     numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
     numbers.hold_frames, numbers.markers_needed = goal.hold_frames, markers_needed(goal.wanted)
@@ -211,32 +211,32 @@ def show_face(goal: ServoGoal, context: StepContext) -> None:
     """Write the face that a law with components uses for a ``goal`` into the workspace; new images may select another
     face.
     """
-    room = context.derived.room
-    if goal.pose_known and (room.numbers.frames_passed or goal.choice.cameras == 0):
-        scene, task = choose(goal, context, room.scene, room.task)
-        _face(room, task.face, scene.camera_centres)
-    elif room.faced is not goal.choice:
-        eyes = law_scene(room.scene, goal.choice).camera_centres
-        _face(room, goal.choice.triple, eyes, goal.choice)
+    workspace = context.derived.workspace
+    if goal.pose_known and (workspace.numbers.frames_passed or goal.choice.cameras == 0):
+        scene, task = choose(goal, context, workspace.scene, workspace.task)
+        _face(workspace, task.face, scene.camera_centres)
+    elif workspace.faced is not goal.choice:
+        eyes = law_scene(workspace.scene, goal.choice).camera_centres
+        _face(workspace, goal.choice.triple, eyes, goal.choice)
 
 
-def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
+def _face(workspace: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
     """Write the face to the workspace: three markers (3,), and the centres (k, 4) of the cameras that see it, as in the
     ``choice``.
     """
-    room.faced, given = choice, room.arrays
+    workspace.faced, given = choice, workspace.arrays
     given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
-    room.numbers.eye_count = len(eyes)
+    workspace.numbers.eye_count = len(eyes)
 
 
-def _found_step(room: Workspace, components: int) -> LawStep:
+def _found_step(workspace: Workspace, components: int) -> LawStep:
     """The result of the law's kernel, with so many components."""
-    given, velocity = room.arrays, room.velocity.copy()
+    given, velocity = workspace.arrays, workspace.velocity.copy()
     if components == 0:
-        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, room.numbers.conditioning)
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, workspace.numbers.conditioning)
     found = given["components"].reshape(-1)[: 2 * components].reshape(2, -1).copy()
     status = given["component_status"][:components].copy()
-    return LawStep(velocity, found[0], found[1], status, room.numbers.conditioning)
+    return LawStep(velocity, found[0], found[1], status, workspace.numbers.conditioning)
 
 
 class GoalError(NamedTuple):
@@ -303,11 +303,11 @@ def _measure(weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArr
 
 
 @kernel
-def follow_goal(block: Record, room: Record) -> bool:
-    """Measure the progress of the goal in the workspace ``room``, as the last part of the observation; returns whether
+def follow_goal(block: Record, workspace: Record) -> bool:
+    """Measure the progress of the goal in the ``workspace``, as the last part of the observation; returns whether
     the goal stays active. Writes its error and body, as in `GoalError`, the gain, and the result of `account_run`.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, c, m = work.joints, work.cameras, work.markers
     aim = Aim(work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2)))
     measured, error_px, work.seen = _measure(
@@ -317,7 +317,7 @@ def follow_goal(block: Record, room: Record) -> bool:
         work.usable[: c * m].reshape((c, m)),
     )
     work.measured, work.error_px = int(measured), error_px
-    arm, points = arm_of(room), work.body[: 4 * m].reshape((m, 4))
+    arm, points = arm_of(workspace), work.body[: 4 * m].reshape((m, 4))
     joints = work.q[:n] + memory.correction[:n]
     points[:] = body_points(arm, joints)
     centre_into(arm, joints, points, Centre(work.centre_weights[:m], work.centre_body), work.centre)
@@ -454,7 +454,7 @@ def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) ->
     if not source.pose_known:
         return scene, task
     before = source.choice
-    if before.cameras > 0 and not context.derived.room.numbers.frames_passed:  # no frame has arrived since
+    if before.cameras > 0 and not context.derived.workspace.numbers.frames_passed:  # no frame has arrived since
         return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
     if choice.cameras == 0:  # no camera sees three markers of one face: keep the previous face
@@ -576,7 +576,7 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     plan = source.plan
     assert plan is not None
     if source.plan_s > 0.0:  # cycles that the loop missed: the arm continued at its last velocity
-        missed = round(context.derived.room.numbers.elapsed_s / context.dt_s) - 1
+        missed = round(context.derived.workspace.numbers.elapsed_s / context.dt_s) - 1
         source.plan_s = min(max(0.0, source.plan_s + missed * context.dt_s), float(plan.times[-1]))
     begin_s = source.plan_s
     set_points, share = _planned_set_points(source, scene)

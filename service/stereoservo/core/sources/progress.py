@@ -200,9 +200,9 @@ def _near_limits(context: StepContext) -> list[Reason]:
     for j, name in enumerate(context.settings.joint_names):
         for bound, side in ((limits.position_max[j], 1.0), (limits.position_min[j], -1.0)):
             limit = float(bound) - side * limits.position_margin
-            room = side * (limit - float(context.q[j]))
-            if room < NEAR_LIMIT and side * moving[j] > 0.0:
-                hint = f"joint {name} is {max(room, 0.0):.3f} from its limit less the margin, and moves towards it"
+            clearance = side * (limit - float(context.q[j]))
+            if clearance < NEAR_LIMIT and side * moving[j] > 0.0:
+                hint = f"joint {name} is {max(clearance, 0.0):.3f} from its limit less the margin, and moves towards it"
                 found.append(Reason("NEAR_LIMIT", "info", name, float(context.q[j]), limit, "rad or m", hint))
     return found
 

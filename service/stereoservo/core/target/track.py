@@ -100,7 +100,7 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
         if not body.told[camera]:  # earlier estimates assumed a static target
             state.cameras[camera].seen_ns[:] = 0
             body.told[camera] = True
-        context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
+        context.derived.workspace.arrays["marker_points"][:] = _points(body, t_ns)
 
 
 def _frame_of(
@@ -125,7 +125,7 @@ def present_arrays(context: StepContext) -> ModelArrays | None:
     if arrays is None or body is None or not body.carried or body.t_ns == 0:
         return arrays
     points = _points(body, context.now_ns)
-    context.derived.room.arrays["marker_points"][:] = points
+    context.derived.workspace.arrays["marker_points"][:] = points
     here = copy(arrays)
     object.__setattr__(here, "marker_points", points)
     return here
