@@ -17,8 +17,8 @@ from stereoservo.core.block import HISTORY, SETTLED_FRAMES
 from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.context import LENS_SIZE, StepContext, Workspace
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.ingest import TAKEN, newest_frames
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays, require_fitting
+from stereoservo.core.ingest import ACCEPTED, newest_frames
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, model_arrays, require_fitting
 from stereoservo.core.monitor_state import MOVED, ModelComparison
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
@@ -38,11 +38,11 @@ from stereoservo.core.prediction import (
     present,
     rows_in_use,
     rows_of,
-    undistort_sights,
+    undistort_observations,
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState, share_sights
+from stereoservo.core.state import CoreState, share_observations
 from stereoservo.core.target import track
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import MAX_MARKERS
@@ -58,14 +58,14 @@ AT_REST = 1e-3
 @kernel
 def estimate(block: Record, workspace: Record) -> None:
     """Stage 2: update the cameras' estimates by the accepted frames in the ``workspace``, except those that Python
-    processes (`take_frames_apart`); then predict the current markers.
+    processes (`take_frames_in_python`); then predict the current markers.
     """
     memory, work = block[0], workspace[0]
     if work.frames_as_stops == 0:
         for c in range(memory.cameras):
             memory.sightings[c].fresh = False
         for k in range(work.frames):
-            if work.arrived_found[k] == TAKEN:
+            if work.arrived_found[k] == ACCEPTED:
                 take_frame(block, workspace, k)
     if memory.history_count > 0:
         present(block, workspace)
@@ -78,7 +78,7 @@ def note_frames(block: Record, workspace: Record) -> None:
     for c in range(memory.cameras):
         memory.sightings[c].fresh = False
     for k in range(work.frames):
-        if work.arrived_found[k] == TAKEN:
+        if work.arrived_found[k] == ACCEPTED:
             note_frame(block, workspace, k)
 
 
@@ -90,7 +90,7 @@ def note_frame(block: Record, workspace: Record, k: int) -> None:
     estimate.last_seq, estimate.last_visible = work.arrived_seq[k], work.arrived_count[k]
 
 
-def take_frames_apart(context: StepContext) -> None:
+def take_frames_in_python(context: StepContext) -> None:
     """Process the frames of a cell with cameras that may move or with a target that is followed. Python processes them
     one by one; `estimate` then processes none.
     """
@@ -99,25 +99,25 @@ def take_frames_apart(context: StepContext) -> None:
         sighting.fresh = False
     found = workspace.arrays["arrived_found"]
     for k, observation in enumerate(newest_frames(context.inputs)):
-        if found[k] == TAKEN:
+        if found[k] == ACCEPTED:
             camera = context.derived.cameras[observation.camera]
             if state.target is not None:
                 track.take_frame(camera, observation, context)
-            _take_frame_apart(camera, k, observation.t_shutter_ns, context)
+            _take_frame_in_python(camera, k, observation.t_shutter_ns, context)
     if state.target is not None:
         context.moved_arrays = track.present_arrays(context)
 
 
-def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> None:
+def _take_frame_in_python(camera: int, k: int, t_ns: int, context: StepContext) -> None:
     """Process a frame like `take_frame`, and check whether the camera moves."""
     state, workspace = context.state, context.derived.workspace
     if context.derived.arrays is None:
         note_frame(state.block.record, workspace.record, k)
         return
     found = see_frame(state.block.record, workspace.record, k)
-    if found & TOLD:  # the arm's position is measured, not only predicted
-        _look_for_motion(camera, t_ns, context)
-    workspace.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
+    if found & MEASURED:  # the arm's position is measured, not only predicted
+        _detect_camera_motion(camera, t_ns, context)
+    workspace.arrays["unknown"][camera] = pose_unknown(camera, state, context.settings)
     fold_frame(state.block.record, workspace.record, k, found)
 
 
@@ -143,7 +143,7 @@ def take_model(context: StepContext) -> None:
         if run is None or run.phase != "take":
             return
         use_model(state.pending_model, context, masked=masked_ids(state))
-        camera_relocalization.taken(run, state, context.now_ns)
+        camera_relocalization.on_model_applied(run, state, context.now_ns)
     elif (
         MOTION_SOURCES[type(state.source)].runs_law
         or state.planning is not None
@@ -163,7 +163,7 @@ def take_model(context: StepContext) -> None:
     state.pending_model, state.pending_reanchored = None, ()
     readiness = str(state.readiness)
     context.emit("model", message=f"model epoch {model.epoch} is {readiness}", name=readiness)
-    track.tell_untrackable(context)
+    track.report_untrackable(context)
 
 
 NOT_COMPARED = Reason(
@@ -178,7 +178,7 @@ def _await_model(update: ModelUpdate, context: StepContext) -> None:
     """Store a model until it may be used; a model of a relocalization must be the one that is expected."""
     state = context.state
     if update.reanchored:
-        refusal = camera_relocalization.misfit(state, update)
+        refusal = camera_relocalization.rejection_reason(state, update)
         if refusal:
             context.emit("warning", message=f"re-anchored model refused: {refusal}")
             return
@@ -198,7 +198,7 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     state.readiness, state.comparison = fitted_readiness(model), None
     offsets = stated_offsets(model)
     state.cameras = [CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras]
-    share_sights(state)
+    share_observations(state)
     state.block.numbers.round_due = 0
     for name in SETTLED_FRAMES:
         getattr(state.block, name)[:] = 0
@@ -227,7 +227,7 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 # -- frames -------------------------------------------------------------------------------------------------
 
 
-def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
+def _detect_camera_motion(camera: int, t_ns: int, context: StepContext) -> None:
     """Check whether a mobile camera moves; while it does, its newest frame is not compared with the prediction."""
     state, workspace, arrays = context.state, context.derived.workspace, context.derived.arrays
     if state.mobile[camera] is None or arrays is None:
@@ -274,7 +274,7 @@ def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, in
         rule = FOLLOWS_MOTION if verdict.kind == "ok" else LEAVES
         if camera.name not in offsets:
             rule = LEAVES
-        elif doubtful or place_unknown(c, state, settings):
+        elif doubtful or pose_unknown(c, state, settings):
             rule = AS_STATED
         rules.append((rule, offsets.get(camera.name, 0)))
     return rules
@@ -300,7 +300,7 @@ def _follow_offset(block: Record, workspace: Record, k: int) -> None:
     timing.product = timing.square = 0.0
 
 
-def place_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
+def pose_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
     """Whether the pose of a camera is unknown: it is being relocalized, or it moves."""
     mobile = state.mobile[camera]
     if mobile is not None and mobile.moving:
@@ -325,7 +325,7 @@ def masked_ids(state: CoreState) -> tuple[int, ...]:
 AGREEING_PX = 1.5
 
 
-KNOWN, TOLD = 1, 2
+KNOWN, MEASURED = 1, 2
 """Bits of the result of `see_frame`: the joints are known at the shutter time; samples on both sides of it exist."""
 
 
@@ -340,8 +340,8 @@ def take_frame(block: Record, workspace: Record, k: int) -> None:
 @kernel
 def see_frame(block: Record, workspace: Record, k: int) -> int:
     """Compare frame ``k`` in the ``workspace`` with the prediction at its shutter time and write the residuals to
-    the workspace. Returns bits: `KNOWN` if the joints are known at that time, `TOLD` if there are samples on both sides
-    of it.
+    the workspace. Returns bits: `KNOWN` if the joints are known at that time, `MEASURED` if there are samples on both
+    sides of it.
 
     For a frame newer than the last joint sample, the current joint velocities are used. Observations that the camera's
     lens cannot produce are ignored.
@@ -355,8 +355,8 @@ def see_frame(block: Record, workspace: Record, k: int) -> int:
     known, then = positions_at(stamps, positions, memory.history_count, shutter_ns)
     q = work.frame_q[:n]
     q[:] = then
-    told, speed = velocities_at(stamps, positions, memory.history_count, shutter_ns)
-    if not told:
+    interpolated, speed = velocities_at(stamps, positions, memory.history_count, shutter_ns)
+    if not interpolated:
         speed = memory.velocities[:n]
     predicted, jacobian = (
         work.predicted[: 2 * m].reshape((1, m, 2)),
@@ -376,7 +376,7 @@ def see_frame(block: Record, workspace: Record, k: int) -> int:
     row = rows_of(work.arrived_ids[at : at + count], work.row_ids[:rows], work.row_of[:rows])
     lens = work.lenses[LENS_SIZE * camera : LENS_SIZE * camera + lens_size]
     if not (lens.size == 4 and lens[0] == 0.0):
-        pixels, covariances, possible = undistort_sights(lens, pixels, covariances)
+        pixels, covariances, possible = undistort_observations(lens, pixels, covariances)
         for i in range(row.size):
             if not possible[i]:
                 row[i] = -1
@@ -389,7 +389,7 @@ def see_frame(block: Record, workspace: Record, k: int) -> int:
         jacobian[0],
         speed,
     )
-    return (KNOWN if known else 0) | (TOLD if known and told else 0)
+    return (KNOWN if known else 0) | (MEASURED if known and interpolated else 0)
 
 
 @kernel
@@ -401,11 +401,11 @@ def fold_frame(block: Record, workspace: Record, k: int, found: int) -> None:
     work = workspace[0]
     if found & KNOWN == 0:
         return
-    if found & TOLD:
+    if found & MEASURED:
         fold_residuals(block, workspace, k)
         _follow_offset(block, workspace, k)
     if work.unknown[work.arrived_camera[k]] == 0:
-        accept_sights(block, workspace, k)
+        gate_frame(block, workspace, k)
 
 
 @kernel
@@ -422,16 +422,16 @@ def fold_residuals(block: Record, workspace: Record, k: int) -> None:
     frame.t_ns, frame.fresh, frame.looked = t_ns, True, False
     at, end = rows * camera, rows * (camera + 1)
     innovation = memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2))
-    spread = memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2))
+    covariance = memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2))
     velocity, seen = memory.frame_velocity[2 * at : 2 * end].reshape((rows, 2)), memory.frame_seen[at:end]
     innovation[:] = work.frame_innovation[: 2 * rows].reshape((rows, 2))
-    spread[:] = work.frame_spread[: 4 * rows].reshape((rows, 2, 2))
+    covariance[:] = work.frame_spread[: 4 * rows].reshape((rows, 2, 2))
     velocity[:] = work.frame_velocity[: 2 * rows].reshape((rows, 2))
     memory.frame_q[n * camera : n * (camera + 1)] = work.frame_q[:n]
     for i in range(rows):
         seen[i] = work.frame_seen[i]
     used = rows_in_use(seen, work.masked[:m])
-    chi2, squares, worst, _, count = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
+    chi2, squares, worst, _, count = camera_chi2(innovation, covariance, used, MODEL_SIGMA_PX)
     frame.chi2 = chi2 / max(2.0 * count, 1.0)
     frame.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     u, v = (0.0, 0.0) if worst < 0 else (innovation[worst, 0], innovation[worst, 1])
@@ -499,7 +499,7 @@ def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, flo
 
 
 @kernel
-def accept_sights(block: Record, workspace: Record, k: int) -> None:
+def gate_frame(block: Record, workspace: Record, k: int) -> None:
     """Gate frame ``k``, whose residuals are in the ``workspace``, and update the estimate of its camera. Masked
     markers are ignored.
 
@@ -546,7 +546,7 @@ def _common_change(block: Record, workspace: Record, camera: int, used: BoolArra
         memory.innovation[2 * at : 2 * (at + m)].reshape((m, 2)),
         memory.seen_ns[at : at + m],
     )
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * m].reshape((m, 2)),
         work.frame_spread[: 4 * m].reshape((m, 2, 2)),
     )
@@ -558,7 +558,7 @@ def _common_change(block: Record, workspace: Record, camera: int, used: BoolArra
         if not (used[i] and seen_ns[i] > 0):
             continue
         rows[count] = i
-        variance[count] = MODEL_SIGMA_PX**2 + 0.5 * (spread[i, 0, 0] + spread[i, 1, 1])
+        variance[count] = MODEL_SIGMA_PX**2 + 0.5 * (covariance[i, 0, 0] + covariance[i, 1, 1])
         for a in range(2):
             change[count, a] = left[count, a] = innovation[i, a] - filtered[i, a]
         d2 = (left[count, 0] ** 2 + left[count, 1] ** 2) / variance[count]
@@ -566,11 +566,11 @@ def _common_change(block: Record, workspace: Record, camera: int, used: BoolArra
         count += 1
     if count < 3 or largest <= HUBER * HUBER:
         return
-    equations, wanted = np.zeros((2 * count + n, n)), np.zeros(2 * count + n)
+    equations, rhs = np.zeros((2 * count + n, n)), np.zeros(2 * count + n)
     weights, step = np.ones(2 * count + n), np.zeros(n)
     for r in range(count):
         for a in range(2):
-            wanted[2 * r + a] = change[r, a]
+            rhs[2 * r + a] = change[r, a]
             for j in range(n):
                 equations[2 * r + a, j] = jacobian[rows[r], a, j] * deviations[j]
     for j in range(n):
@@ -580,7 +580,7 @@ def _common_change(block: Record, workspace: Record, camera: int, used: BoolArra
             distance = math.sqrt((left[r, 0] ** 2 + left[r, 1] ** 2) / variance[r])
             weight = math.sqrt(min(1.0, HUBER / max(distance, 1e-9)) / variance[r])
             weights[2 * r] = weights[2 * r + 1] = weight
-        step[:] = joint_step(equations, wanted, weights, 0.0)
+        step[:] = joint_step(equations, rhs, weights, 0.0)
         for r in range(count):
             for a in range(2):
                 explained = 0.0
@@ -621,12 +621,12 @@ def _compare(
     work, markers, n = workspace[0], jacobian.shape[0], jacobian.shape[2]
     rows, pixels, covariances = observations
     count = markers + standing.shape[0]
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * count].reshape((count, 2)),
         work.frame_spread[: 4 * count].reshape((count, 2, 2)),
     )
     velocity = work.frame_velocity[: 2 * count].reshape((count, 2))
-    innovation[:], spread[:], velocity[:] = 0.0, 0.0, 0.0
+    innovation[:], covariance[:], velocity[:] = 0.0, 0.0, 0.0
     work.frame_seen[:count], work.frame_noise[:count] = 0, 1.0
     for k in range(rows.size):
         i = rows[k]
@@ -642,10 +642,10 @@ def _compare(
             v += jacobian[i, 1, j] * speed[j] if i < markers else 0.0
         velocity[i, 0], velocity[i, 1] = u, v
         t = TIMING_SIGMA_S * TIMING_SIGMA_S
-        spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
-        spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
-        spread[i, 1, 0] = spread[i, 0, 1]
-        spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
+        covariance[i, 0, 0] = covariances[k, 0, 0] + t * u * u
+        covariance[i, 0, 1] = covariances[k, 0, 1] + t * u * v
+        covariance[i, 1, 0] = covariance[i, 0, 1]
+        covariance[i, 1, 1] = covariances[k, 1, 1] + t * v * v
 
 
 @kernel
@@ -656,13 +656,13 @@ def _fold_in(block: Record, workspace: Record, k: int, used: BoolArray, common: 
     ``used`` (m,): markers to use.
     ``common`` (m, 2) [px]: the common change of all markers since the filtered innovations, which the gate subtracts.
 
-    The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SIGHT_SIGMA_PX` for markers that
+    The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SEEN_SIGMA_PX` for markers that
     were not seen recently.
     """
     memory, work = block[0], workspace[0]
     m, t_ns = memory.markers, work.arrived_ns[k]
     at, end = m * work.arrived_camera[k], m * (work.arrived_camera[k] + 1)
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * m].reshape((m, 2)),
         work.frame_spread[: 4 * m].reshape((m, 2, 2)),
     )
@@ -679,10 +679,10 @@ def _fold_in(block: Record, workspace: Record, k: int, used: BoolArray, common: 
         if known:
             x -= filtered[i, 0]
             y -= filtered[i, 1]
-        model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
+        model = MODEL_SIGMA_PX if known else FIRST_SEEN_SIGMA_PX
         off = model * model
         a, b = (x - common[i, 0], y - common[i, 1]) if known else (x, y)
-        d2 = distance2(a, b, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
+        d2 = distance2(a, b, covariance[i, 0, 0] + off, covariance[i, 0, 1], covariance[i, 1, 1] + off)
         if not d2 <= work.gate:
             refused += 1
             continue

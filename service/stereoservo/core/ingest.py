@@ -19,7 +19,7 @@ from stereoservo.core.context import MAX_FRAMES, Ingested, StepContext
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import LEAST_APART_NS, Refused
+from stereoservo.core.state import LEAST_SEPARATION_NS, Refused
 from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
@@ -46,10 +46,10 @@ FRESH_FRAMES = 2.5  # without a frame for so many periods, a law counts as coast
 
 
 STAMP, VALUES = 2, 3
-"""Results for a joint sample or a frame: `STAMP` and `VALUES` are reasons of rejection, `TAKEN` is accepted, `NO_NEWS`
-was received before.
+"""Results for a joint sample or a frame: `STAMP` and `VALUES` are reasons of rejection, `NO_NEWS` was received
+before.
 """
-NO_NEWS, TAKEN = 0, 1
+NO_NEWS, ACCEPTED = 0, 1
 REFUSED = 1
 """Bit of the stages' detections: an impossible input, or a loop that was interrupted."""
 
@@ -77,7 +77,7 @@ def ingest(block: Record, workspace: Record) -> int:
     if work.gap != 0:
         memory.command[: memory.joints] = 0.0
         forget_travel(block)
-    return REFUSED if work.gap != 0 or work.joints_found > TAKEN or work.frames_refused != 0 else 0
+    return REFUSED if work.gap != 0 or work.joints_found > ACCEPTED or work.frames_refused != 0 else 0
 
 
 @kernel
@@ -101,7 +101,7 @@ def _forget_stamps(block: Record) -> None:
 
 @kernel
 def _take_joints(block: Record, workspace: Record) -> int:
-    """Store the joint sample in the ``workspace`` if it is new and in time; returns `NO_NEWS`, `TAKEN`, `STAMP` or
+    """Store the joint sample in the ``workspace`` if it is new and in time; returns `NO_NEWS`, `ACCEPTED`, `STAMP` or
     `VALUES`.
     """
     memory, work = block[0], workspace[0]
@@ -113,7 +113,7 @@ def _take_joints(block: Record, workspace: Record) -> int:
         take_sample(block, workspace, False)
         return STAMP
     if take_sample(block, workspace, work.joints_whole != 0) and work.joints_whole != 0:
-        return TAKEN
+        return ACCEPTED
     return VALUES
 
 
@@ -127,7 +127,7 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
     ``t_ns``, ``positions`` (n,): the new entry.
     """
     size = stamps.size
-    if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_APART_NS:
+    if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_SEPARATION_NS:
         count -= 1
     slot = count % size
     stamps[slot] = t_ns
@@ -351,7 +351,7 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
 
 @kernel
 def pass_frames(block: Record, workspace: Record) -> None:
-    """Decide for each frame in the ``workspace``: `TAKEN`, `STAMP`, `VALUES`, or `NO_NEWS`.
+    """Decide for each frame in the ``workspace``: `ACCEPTED`, `STAMP`, `VALUES`, or `NO_NEWS`.
 
     A frame that is too old does not stop the arm: the law coasts as if the frame had been lost, and brakes in time. If
     a camera restarts its sequence numbers, its frames are recognised by their stamps, which are checked; sequence
@@ -367,7 +367,7 @@ def pass_frames(block: Record, workspace: Record) -> None:
         found = NO_NEWS
         if c >= 0 and seq != last_seq[c] and not (seq < last_seq[c] and t_ns <= accepted_ns[c]):
             found = _judged(workspace, k)
-        if found == TAKEN:
+        if found == ACCEPTED:
             last_seq[c], accepted_ns[c] = seq, max(accepted_ns[c], t_ns)
             work.frames_passed += 1
         elif found != NO_NEWS:
@@ -377,12 +377,12 @@ def pass_frames(block: Record, workspace: Record) -> None:
 
 @kernel
 def _judged(workspace: Record, k: int) -> int:
-    """Result for the new frame ``k`` of the ``workspace``: `TAKEN`, or the reason of rejection."""
+    """Result for the new frame ``k`` of the ``workspace``: `ACCEPTED`, or the reason of rejection."""
     work = workspace[0]
     if not 0.0 <= (work.now_ns - work.arrived_ns[k]) * 1e-9 <= work.frame_timeout_s:
         return STAMP
     outside, vague = first_wrong(workspace, k)
-    return VALUES if work.arrived_count[k] < 0 or outside >= 0 or vague >= 0 else TAKEN
+    return VALUES if work.arrived_count[k] < 0 or outside >= 0 or vague >= 0 else ACCEPTED
 
 
 @kernel
@@ -416,7 +416,7 @@ def passed_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], 
     """The accepted frames, each with the index of its camera."""
     found, cameras = context.derived.workspace.arrays["arrived_found"], context.derived.cameras
     frames = newest_frames(context.inputs)
-    return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == TAKEN])
+    return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == ACCEPTED])
 
 
 def account_inputs(context: StepContext) -> Ingested:
@@ -425,9 +425,9 @@ def account_inputs(context: StepContext) -> Ingested:
     """
     state, work = context.state, context.derived.workspace.numbers
     joints, sample = work.joints_found, context.inputs.joints
-    taken = sample if joints == TAKEN else None
+    accepted = sample if joints == ACCEPTED else None
     refused_joints = None
-    if sample is not None and joints > TAKEN:
+    if sample is not None and joints > ACCEPTED:
         refused_joints = _late(sample, context) if joints == STAMP else _wrong(sample, context)
     passed = passed_frames(context) if work.frames_passed else ()
     refused_frames = _refused_frames(context) if work.frames_refused else ()
@@ -435,7 +435,7 @@ def account_inputs(context: StepContext) -> Ingested:
     stops = tuple(reason for reason in (gap, refused_joints) if reason is not None)
     if MOTION_SOURCES[type(state.source)].by_images:
         stops += tuple(reason for _, reason in refused_frames if reason.level == "hold")
-    if taken is not None:
+    if accepted is not None:
         state.refused_joints.reason = None
     if refused_joints is not None:
         _count(state.refused_joints, refused_joints)
@@ -443,7 +443,7 @@ def account_inputs(context: StepContext) -> Ingested:
         state.refused_frames[camera].reason = None
     for camera, reason in refused_frames:
         _count(state.refused_frames[camera], reason)
-    return Ingested(taken, passed, work.elapsed_s, refused_joints, refused_frames, gap, stops)
+    return Ingested(accepted, passed, work.elapsed_s, refused_joints, refused_frames, gap, stops)
 
 
 def _count(refused: Refused, reason: Reason) -> None:
@@ -553,11 +553,11 @@ def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
             refused.append((cameras[frame.camera], reason))
         elif found[k] == VALUES:
             camera = cameras[frame.camera]
-            refused.append((camera, _impossible_frame(frame, _wrong_sights(frame, k, context))))
+            refused.append((camera, _impossible_frame(frame, _wrong_observations(frame, k, context))))
     return tuple(refused)
 
 
-def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str:
+def _wrong_observations(frame: CameraObservation, k: int, context: StepContext) -> str:
     """What is impossible in the markers of frame ``k``."""
     count = len(frame.ids)
     if count > MAX_MARKERS:

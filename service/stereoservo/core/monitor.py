@@ -30,7 +30,7 @@ from stereoservo.core.context import Finding, StepContext, Workspace
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.ingest import TAKEN, VALUES
+from stereoservo.core.ingest import ACCEPTED, VALUES
 from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
@@ -174,8 +174,8 @@ def detect(block: Record, workspace: Record) -> int:
     memory, work = block[0], workspace[0]
     halted = work.stopped != 0 or work.stop != 0 or (work.active != 0 and stops_arm(workspace))
     found = 0
-    work.contact = work.contact_watched = work.looked_at = work.odd = work.any_masked = 0
-    if work.joints_found == TAKEN and work.joints_ns > memory.loads_ns:
+    work.contact = work.contact_watched = work.looked_at = work.inconsistent = work.any_masked = 0
+    if work.joints_found == ACCEPTED and work.joints_ns > memory.loads_ns:
         moving, beyond = account_loads(block, workspace, halted)
         work.contact_watched, work.contact = int(moving), int(beyond)
         if (beyond and work.watches_loads != 0) or (moving and work.learning != 0):
@@ -190,10 +190,10 @@ def detect(block: Record, workspace: Record) -> int:
         return found | NOT_FOLLOWING
     if work.modelled == 0:
         return found
-    if work.rounds_apart == 0 and memory.history_count > 0 and work.faulty == 0 and round_is_due(block):
-        looked_at, odd, masked = judge_round(block, workspace, 0)
-        work.looked_at, work.odd, work.any_masked = looked_at, odd, int(masked)
-        if looked_at != 0 and (odd != 0 or masked or work.quiet == 0):
+    if work.rounds_in_python == 0 and memory.history_count > 0 and work.faulty == 0 and round_is_due(block):
+        looked_at, inconsistent, masked = judge_round(block, workspace, 0)
+        work.looked_at, work.inconsistent, work.any_masked = looked_at, inconsistent, int(masked)
+        if looked_at != 0 and (inconsistent != 0 or masked or work.quiet == 0):
             found |= ROUND
     for c in range(memory.cameras):
         if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
@@ -205,12 +205,12 @@ def detect(block: Record, workspace: Record) -> int:
 def stops_arm(workspace: Record) -> bool:
     """Whether inputs rejected by `ingest` stop an arm that may move."""
     work = workspace[0]
-    if work.gap != 0 or work.joints_found > TAKEN:
+    if work.gap != 0 or work.joints_found > ACCEPTED:
         return True
     stops = False
     for k in range(work.frames):
         wrong = work.arrived_found[k] == VALUES or work.arrived_ns[k] > work.now_ns
-        stops = stops or (work.by_images != 0 and work.arrived_found[k] > TAKEN and wrong)
+        stops = stops or (work.by_images != 0 and work.arrived_found[k] > ACCEPTED and wrong)
     return stops
 
 
@@ -511,15 +511,15 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     watching = state.watching
     if arrays is None:
         return None
-    if work.rounds_apart:
-        _judge_round_apart(context)
-    looked_at, odd, masked = work.looked_at, work.odd, work.any_masked
+    if work.rounds_in_python:
+        _judge_round_in_python(context)
+    looked_at, inconsistent, masked = work.looked_at, work.inconsistent, work.any_masked
     if not looked_at:
         return None
-    if not odd and not masked and watching.last == QUIET and watching.verdict == NOISE:
+    if not inconsistent and not masked and watching.last == QUIET and watching.verdict == NOISE:
         return None
     verdict = NOISE
-    if odd and not _all_late(_cameras(odd), watching, context.settings):
+    if inconsistent and not _all_late(_cameras(inconsistent), watching, context.settings):
         problem = present_problem(state, _cameras(looked_at), arrays, context.settings)
         found = diagnosed_beside_joint_errors(problem, proven=state.reanchoring is not None)
         verdict = beside_target(found, state)
@@ -529,7 +529,7 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     return _changed(watching)
 
 
-def _judge_round_apart(context: StepContext) -> None:
+def _judge_round_in_python(context: StepContext) -> None:
     """Run `judge_round` if a round is due, without the cameras that move. Readings from a faulty drive must not be used
     to judge cameras.
     """
@@ -539,7 +539,7 @@ def _judge_round_apart(context: StepContext) -> None:
         return
     moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
     work = workspace.numbers
-    work.looked_at, work.odd, work.any_masked = judge_round(state.block.record, workspace.record, moving)
+    work.looked_at, work.inconsistent, work.any_masked = judge_round(state.block.record, workspace.record, moving)
 
 
 def _cameras(bits: int) -> list[int]:
@@ -556,7 +556,7 @@ def judge_round(block: Record, workspace: Record, moving: int) -> tuple[int, int
     """
     memory, work = block[0], workspace[0]
     rows, masked, now_ns = memory.rows, work.masked[: memory.markers], work.now_ns
-    known = odd = 0
+    known = inconsistent = 0
     for c in range(memory.cameras):
         frame, bit = memory.sightings[c], 1 << c
         age_s = (now_ns - frame.t_ns) * 1e-9
@@ -573,8 +573,8 @@ def judge_round(block: Record, workspace: Record, moving: int) -> tuple[int, int
             MODEL_SIGMA_PX,
         )
         if not (chi2 <= work.noise_chi2[count] and largest <= work.gate):
-            odd |= bit
-    return known, odd, bool((masked > 0.0).any())
+            inconsistent |= bit
+    return known, inconsistent, bool((masked > 0.0).any())
 
 
 def _all_late(cameras: list[int], watching: ModelMonitor, settings: CoreSettings) -> bool:
@@ -737,7 +737,7 @@ def _refuses(state: CoreState) -> bool:
     )
 
 
-def looks_apart(state: CoreState) -> bool:
+def rounds_in_python(state: CoreState) -> bool:
     """Whether Python examines the rounds of frames: some cameras may move or are being relocalized."""
     return state.reanchoring is not None or any(state.mobile)
 
@@ -752,7 +752,7 @@ MONITORS: tuple[Monitor, ...] = (
     Monitor(
         "innovations",
         _monitor_innovations,
-        lambda state: state.watching.verdict.kind != "ok" or looks_apart(state),
+        lambda state: state.watching.verdict.kind != "ok" or rounds_in_python(state),
     ),
     Monitor("comparison", _compare_kept_model, lambda state: state.readiness is ModelReadiness.UNCONFIRMED),
     Monitor("model", _monitor_model, lambda state: state.readiness is ModelReadiness.SUSPECT),

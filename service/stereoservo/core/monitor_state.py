@@ -186,7 +186,7 @@ class DriveDelays(NamedTuple):
     ``onset`` (7, n): the measurement in progress.
     ``sent`` (n,) [rad or m]: total commanded travel, and ``past`` (r, n) that of the last r steps.
     ``velocity`` (n,): the commands that take effect now.
-    ``under_way`` (n,): travel that is commanded and has not taken effect yet.
+    ``in_transit`` (n,): travel that is commanded and has not taken effect yet.
     ``missing`` (n,): recent effective minus measured travel.
     ``accounted`` (n,): effective travel at the last joint sample.
     """
@@ -197,6 +197,6 @@ class DriveDelays(NamedTuple):
     sent: FloatArray
     past: FloatArray
     velocity: FloatArray
-    under_way: FloatArray
+    in_transit: FloatArray
     accounted: FloatArray
     missing: FloatArray

@@ -198,7 +198,7 @@ def move(context: StepContext) -> None:
     state, derived = context.state, context.derived
     step, goal = derived.motion
     source: Any = state.source
-    output = drive(source, context) if context.goes_on else step(source, context)
+    output = drive(source, context) if context.stays_active else step(source, context)
     if output is not None:
         _put_output(output, context)
     if state.friction_of != goal:

@@ -16,7 +16,7 @@ from stereoservo.core.cycle import NOT_MEASURED, Status
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
@@ -44,7 +44,7 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
         if output.finished:
             finish(output, context)
     state.step += 1
-    if state.step % context.derived.look_every or not context.derived.workspace.numbers.runs:
+    if state.step % context.derived.check_every or not context.derived.workspace.numbers.runs:
         return
     source = state.source
     examine = MOTION_SOURCES[type(source)].examine
@@ -148,7 +148,7 @@ def priors_of(context: StepContext) -> tuple[Prior, ...]:
     moving: list[int] = []
     unknown: tuple[str, ...] = ()
     if state.reanchoring is not None or any(state.mobile):
-        prediction, moving, unknown = moving_camera.to_look_from(arrays, context)
+        prediction, moving, unknown = moving_camera.prediction_for_priors(arrays, context)
     return priors(arrays, context, prediction, moving, unknown)
 
 
@@ -248,19 +248,14 @@ def priors(
     Earlier observations of cameras that are ``moving`` are not used. Cameras whose pose is ``unknown`` have no prior:
     their detectors search the whole image.
     """
-    state, workspace, now_ns = context.state, context.derived.workspace, context.now_ns
+    state, room, now_ns = context.state, context.derived.workspace, context.now_ns
     shape = prediction.pixels.shape
     expected = Expected(np.empty(shape), np.empty(shape), np.empty((*shape, 2)))
     pixels, speed, covariance = expected
     if arrays.joint_accuracy is not None:
-        workspace.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
+        room.unseen_px[:] = _unseen_sigma(prediction.jacobian, arrays)
     beyond = expect_sights(
-        state.block.record,
-        workspace.record,
-        prediction.pixels,
-        prediction.jacobian,
-        sum([1 << c for c in moving]),
-        expected,
+        state.block.record, room.record, prediction.pixels, prediction.jacobian, sum([1 << c for c in moving]), expected
     )
     found = []
     for c, (camera, estimate) in enumerate(zip(context.settings.cameras, state.cameras, strict=True)):
@@ -292,7 +287,7 @@ class Expected(NamedTuple):
 
 @kernel
 def expect_sights(
-    block: Record, workspace: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
+    block: Record, room: Record, predicted: FloatArray, jacobian: FloatArray, moving: int, expected: Expected
 ) -> int:
     """Write the expected observations of all cameras to ``expected``, distorted by their lenses: ``predicted`` (c, m,
     2) pixels with their ``jacobian`` (c, m, 2, n), plus the innovations of recently seen markers. Returns a bit mask of
@@ -301,7 +296,7 @@ def expect_sights(
 
     Cameras whose bits are set in ``moving`` have no recent observations.
     """
-    memory, work = block[0], workspace[0]
+    memory, work = block[0], room[0]
     n, m, lens_size = memory.joints, memory.markers, work.lens_size
     beyond = 0
     for c in range(memory.cameras):
@@ -333,7 +328,7 @@ def expect_sights(
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
     """Standard deviations (c, m) [px] of markers that were not seen recently, from their ``jacobian`` (c, m, 2, n)."""
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
-    return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
+    return np.asarray(np.minimum(np.sqrt(FIRST_SEEN_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 
 
 @kernel

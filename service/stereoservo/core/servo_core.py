@@ -30,8 +30,8 @@ from stereoservo.core.estimate import (
     load_limits,
     note_frames,
     offset_rules,
-    place_unknown,
-    take_frames_apart,
+    pose_unknown,
+    take_frames_in_python,
     take_model,
     workspace,
 )
@@ -47,12 +47,12 @@ from stereoservo.core.ingest import (
     put_inputs,
 )
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import NOISE, QUIET, detect, looks_apart, monitor, monitors_attend
+from stereoservo.core.monitor import NOISE, QUIET, detect, monitor, monitors_attend, rounds_in_python
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import MOTION_SOURCES, arrange_motion, move, paused
 from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.law import aim_at, by_kernel, follow_goal
+from stereoservo.core.sources.law import by_kernel, follow_goal, set_goal
 from stereoservo.core.state import (
     CoreState,
     Holding,
@@ -79,7 +79,7 @@ def observe(context: StepContext, *, decides: bool) -> int:
     work, record, space = workspace.numbers, block.record, workspace.record
     found = ingest(record, space)
     if work.frames_as_stops:
-        take_frames_apart(context)
+        take_frames_in_python(context)
     if derived.arrays is None:
         note_frames(record, space)
     else:
@@ -92,12 +92,12 @@ def observe(context: StepContext, *, decides: bool) -> int:
                 workspace.pixels,
             )
     found |= detect(record, space)
-    context.goes_on = bool(work.aims) and not found and not decides and follow_goal(record, space)
+    context.stays_active = bool(work.has_goal) and not found and not decides and follow_goal(record, space)
     return found
 
 
 PRIOR_RATE_HZ = 125.0
-LOOK_EVERY_S = 0.2
+CHECK_EVERY_S = 0.2
 """Interval between two examinations of why a law is slow or stuck [s]."""
 BY_KERNELS = (ServoGoal, Holding)
 """Motion sources whose steps do not read the inputs."""
@@ -180,7 +180,7 @@ class ServoCore:
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
             workspace=workspace(settings, model),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
-            look_every=max(1, round(settings.rate_hz * LOOK_EVERY_S)),
+            check_every=max(1, round(settings.rate_hz * CHECK_EVERY_S)),
             load_limits=load_limits(settings, model),
         )
         if model is not None:
@@ -276,29 +276,29 @@ def arrange(context: StepContext) -> None:
     work.active, work.faulty = state.lifecycle is Lifecycle.ACTIVE, state.lifecycle in FAULTY
     work.stopped, work.by_images = state.stopped, kind.by_images
     work.learning = isinstance(state.source, TrialMotion)
-    work.rounds_apart = looks_apart(state)
+    work.rounds_in_python = rounds_in_python(state)
     work.frames_as_stops = any(state.mobile) or state.target is not None
     work.quiet = watching.last == QUIET and watching.verdict == NOISE
     work.paused = paused(state)
     if derived.arrays is not None:
         given["masked"][:] = watching.masked
     for c, (rule, stated_ns) in enumerate(offset_rules(state, settings)):
-        given["unknown"][c] = place_unknown(c, state, settings)
+        given["unknown"][c] = pose_unknown(c, state, settings)
         given["offset_rule"][c], given["stated_offset_ns"][c] = rule, stated_ns
     inexact = state.model is not None and state.model.joint_accuracy is not None
     given["friction_most"][:], given["friction_travel"][:] = friction_bounds(
         settings.joint_kinds, settings.resolution, inexact
     )
     source = state.source
-    work.aims = (
+    work.has_goal = (
         isinstance(source, ServoGoal)
         and derived.arrays is not None
         and by_kernel(source, derived.laws[source.law])
         and bool(work.active)
         and not work.paused
     )
-    if work.aims and isinstance(source, ServoGoal):
-        aim_at(workspace, source)
+    if work.has_goal and isinstance(source, ServoGoal):
+        set_goal(workspace, source)
     arrange_motion(context)
 
 

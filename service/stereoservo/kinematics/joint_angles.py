@@ -46,7 +46,7 @@ MAX_SIGMA_FACTOR = 3.0
 """Residual [stated sigmas, rms] above which the pixels do not belong to this chain and these points."""
 EXACT = 1e-4
 """Cost at which equations without redundancy count as solved."""
-MISFIT_TAIL = 1e-6
+RESIDUAL_TAIL = 1e-6
 """Probability below which a cost is not explained by noise."""
 LARGEST_DEVIATION = 0.1
 """Standard deviation [rad or m] above which a joint counts as not observable."""
@@ -178,7 +178,7 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
     freedom = max(0, problem.freedom)
     factor = max(1.0, best / max(1, freedom))
     # As many equations as joints are solved exactly or not at all.
-    chance = 2.0 * float(gammainccinv(0.5 * freedom, MISFIT_TAIL)) if freedom else EXACT  # of chi-square
+    chance = 2.0 * float(gammainccinv(0.5 * freedom, RESIDUAL_TAIL)) if freedom else EXACT  # of chi-square
     if best > MAX_SIGMA_FACTOR**2 * chance:
         raise JointAnglesError(
             "no_agreement",

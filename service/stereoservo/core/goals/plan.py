@@ -134,7 +134,7 @@ def _posture(named: dict[str, float], joints: FloatArray, context: StepContext) 
     return posture
 
 
-def go_on_planning(job: PlanJob) -> bool:
+def plan_slice(job: PlanJob) -> bool:
     """Do one step's share of planning a path; returns whether planning is complete. For a large body it is complete one
     step later, and reported then.
     """
@@ -238,15 +238,15 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     count = min(reported_samples(arrays), len(plan.times))
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
-    way = plan.description
+    description = plan.description
     path = context.derived.laws[source.law].path
     if path != "planned":
         seconds = max(seconds, _exponential_s(job, context))
         if path == "free":
-            way = f"not guaranteed: law {source.law!r} goes its own way; the straight one is free"
+            description = f"not guaranteed: law {source.law!r} goes its own way; the straight one is free"
     return PlanReport(
         law=source.law,
-        way=way,
+        way=description,
         seconds=seconds,
         approaches=tuple(_approach(approach, job, context) for approach in plan.approaches),
         shares=tuple(float(plan.path_parameters[k]) for k in at),
@@ -376,7 +376,7 @@ def prepare(
         goal=goal,
         resolution=begin_resolution(body, context.q + context.state.block.correction, law.needs_goal_pose),
     )
-    if body.arrays.sights <= AT_ONCE:
+    if body.arrays.observation_count <= AT_ONCE:
         set_up(job, context)
     if job.source is None or (job.planning is not None):
         return job
@@ -404,20 +404,20 @@ def set_up(job: PlanJob, context: StepContext) -> bool:
     """
     while not _set_up_part(job, context):
         assert context.arrays is not None
-        if context.arrays.sights > AT_ONCE:
+        if context.arrays.observation_count > AT_ONCE:
             return False
     return True
 
 
 def _set_up_part(job: PlanJob, context: StepContext) -> bool:
-    aim, arrays = job.resolution, context.arrays
+    resolved, arrays = job.resolution, context.arrays
     assert arrays is not None
-    if aim is not None and job.source is None:
-        place = BodyState(context.settings, arrays, aim.start, aim.operators, aim.faces)
+    if resolved is not None and job.source is None:
+        place = BodyState(context.settings, arrays, resolved.start, resolved.operators, resolved.faces)
         target = job.goal.target
         assert isinstance(target, Resolvable)
-        if resolve_part(aim, target, place):
-            job.source, job.resolution = start_servoing(job.goal, aim, context), None
+        if resolve_part(resolved, target, place):
+            job.source, job.resolution = start_servoing(job.goal, resolved, context), None
             return job.purpose == "enqueue" or not job.source.pose_known
     elif job.planning is None:
         begin_plan(job, context)

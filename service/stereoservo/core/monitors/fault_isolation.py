@@ -41,7 +41,7 @@ SUSPECT_MARKERS = 3
 """Number of suspect markers, each of which is left out in turn."""
 FEWEST_ON_ARM = 4
 """Least number of markers on the arm for a camera to confirm that the arm agrees with its joint readings."""
-WAYS_OUT = (
+REMEDIES = (
     "Where cameras moved: put them back and resume, or calibrate. Where joints are off: calibrate --check "
     "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in "
     "view of every camera ([scene] static) tell them apart"
@@ -192,7 +192,7 @@ def doubt(problem: LinearisedProblem, moved: list[int], px: float) -> str:
     )
     return (
         f"{disagree}: either {'all of them' if some else 'it'} moved, or {arm}; these cannot be told apart, "
-        f"for no other camera confirms the joints and {why}. {WAYS_OUT}"
+        f"for no other camera confirms the joints and {why}. {REMEDIES}"
     )
 
 
@@ -284,14 +284,14 @@ def _described(problem: LinearisedProblem, cause: IsolatedChange, words: str) ->
     joint = settings.joint_names[cause.index]
     deviation = _joint_deviation(problem, cause.index)
     if settings.joint_kinds[cause.index] == "revolute":
-        size, spread, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
+        size, sigma, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
     else:
-        size, spread, unit = 1e3 * cause.amount, 1e3 * deviation, "mm"
+        size, sigma, unit = 1e3 * cause.amount, 1e3 * deviation, "mm"
     text = (
-        f"the zero of joint {joint} is off by {size:+.3g} ± {spread:.1g} {unit} ({px:.3g} px rms): calibrate "
+        f"the zero of joint {joint} is off by {size:+.3g} ± {sigma:.1g} {unit} ({px:.3g} px rms): calibrate "
         "--check --reset-zeros"
     )
-    return ModelDiagnosis("joint_zero", (joint,), size, spread, unit, px, text)
+    return ModelDiagnosis("joint_zero", (joint,), size, sigma, unit, px, text)
 
 
 def _joint_deviation(problem: LinearisedProblem, joint: int) -> float:

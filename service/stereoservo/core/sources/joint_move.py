@@ -23,11 +23,11 @@ ARRIVED_STEPS = 5
 
 def joint_goal(goal: Goal, target: JointTarget, context: StepContext) -> JointMove:
     """The move to ``target``. Raises RefusalError for unknown joints and positions beyond limits."""
-    wanted = context.q.copy()
+    goal_q = context.q.copy()
     for name, position in target.positions.items():
-        wanted[joint_index(name, context.settings)] = position
-    _inside_limits(wanted, context)
-    move = joint_move_to(goal.id, wanted, goal.speed_scale, context, goal.time_limit_s, goal.lease_s)
+        goal_q[joint_index(name, context.settings)] = position
+    _inside_limits(goal_q, context)
+    move = joint_move_to(goal.id, goal_q, goal.speed_scale, context, goal.time_limit_s, goal.lease_s)
     move.acknowledge_s = goal.acknowledge_s
     return move
 
@@ -117,12 +117,12 @@ def first_inside(box: FloatArray, margin: float, start: FloatArray, target: Floa
     enters, leaves = 0.0, 1.0
     for j in range(start.size):
         low, high = box[j, 0] - margin, box[j, 1] + margin
-        way = float(target[j] - start[j])
-        if way == 0.0:
+        travel = float(target[j] - start[j])
+        if travel == 0.0:
             if not low <= start[j] <= high:
                 return None
             continue
-        first, second = sorted(((low - start[j]) / way, (high - start[j]) / way))
+        first, second = sorted(((low - start[j]) / travel, (high - start[j]) / travel))
         enters, leaves = max(enters, float(first)), min(leaves, float(second))
     return enters if 0.0 < enters <= leaves else None
 
@@ -185,7 +185,7 @@ def joints_ahead(context: StepContext) -> FloatArray:
     if not delays.delay_s.any():
         return context.q
     lost = np.abs(block.friction) * delays.delay_s if context.state.friction_of else 0.0
-    return context.q + delays.under_way - np.clip(delays.under_way, -lost, lost)
+    return context.q + delays.in_transit - np.clip(delays.in_transit, -lost, lost)
 
 
 def arrived(q: FloatArray, target: FloatArray, settings: CoreSettings) -> bool:
