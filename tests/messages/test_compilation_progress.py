@@ -40,7 +40,7 @@ def test_a_process_tells_each_kernel_that_it_compiles(tmp_path: Path, monkeypatc
     listeners = []
     with monkeypatch.context() as patched:
         patched.setattr(compilation.event, "register", lambda kind, listener: listeners.append(listener))
-        kernel_compilation.tell_progress(tmp_path, "first", 7, 380)
+        kernel_compilation.report_progress(tmp_path, "first", 7, 380)
     (listener,) = listeners
     with compilation.event.install_listener("numba:compile", listener):
         dispatcher = KERNELS[__name__, "_twice"]
@@ -103,7 +103,7 @@ def test_status_and_log_say_how_far_it_is(
     lines = ProgressLines()
     for done in (3, 3, 90):
         _tell(tmp_path, done)
-        lines.look(tmp_path)
+        lines.check(tmp_path)
     told = capfd.readouterr().err.splitlines()
     assert [line.split("(")[-1] for line in told] == [
         "rest: 3 of about 380 kernels)",

@@ -122,8 +122,8 @@ class Acceptance(msgspec.Struct, frozen=True):
     advice: tuple[str, ...] = ()
 
 
-def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float | None = None) -> Acceptance:
-    """Assessment of a fitted model. ``depth_spread``: largest relative deviation of a marker's depth, if known."""
+def assess_fit(model: CellModel, report: CalibrationReport, depth_deviation: float | None = None) -> Acceptance:
+    """Assessment of a fitted model. ``depth_deviation``: largest relative deviation of a marker's depth, if known."""
     reasons: list[str] = []
     advice: list[str] = []
     statistics = model.statistics
@@ -138,7 +138,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
             "several at once is untested"
         )
         advice.append("stops of all joints at once (calibration.together) test it; do the markers stay in view there?")
-    _identified(model, report, depth_spread, reasons, advice)
+    _identified(model, report, depth_deviation, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (
         ", as the measurement noise explains" if statistics.chi2_ok else ""
@@ -278,7 +278,7 @@ def _identified(
         advice.append("larger trial motions, markers larger in the image or more stops make it better")
 
 
-def depth_spread(model: CellModel, trials: TrialData) -> float | None:
+def depth_deviation(model: CellModel, trials: TrialData) -> float | None:
     """Largest relative standard deviation of a marker's depth in the left camera; None in the projective stratum.
 
     From the curvature of the fit at the model, over the trials' own stops and sigmas.
@@ -299,8 +299,8 @@ def depth_spread(model: CellModel, trials: TrialData) -> float | None:
     root = column_root(triangle, bounded=True)
     at = charts.start(3)
     depths = rig.points @ rig.cameras[0][2]
-    spreads = []
+    deviations = []
     for i, basis in enumerate(charts.points):
         rows = basis @ rig.cameras[0][2] @ root[at + 3 * i : at + 3 * i + 3]
-        spreads.append(float(np.linalg.norm(rows)) / abs(float(depths[i])))
-    return max(spreads)
+        deviations.append(float(np.linalg.norm(rows)) / abs(float(depths[i])))
+    return max(deviations)

@@ -126,7 +126,7 @@ class HangWatch:
         self._reader.newest()
         self._limit_s = None
 
-    def look(self, now_s: float, *, late: bool = False) -> str:
+    def check(self, now_s: float, *, late: bool = False) -> str:
         """Description of how the process hangs, '' if it does not. ``late``: the watchdog itself was late, so the
         measurement starts again.
         """

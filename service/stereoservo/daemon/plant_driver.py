@@ -40,7 +40,7 @@ APPEARS_S = 4.0
 """Time for which a call waits for a plant that is being started [s]; the call may be repeated."""
 CALL_S = 10.0
 """Time for which a call waits for its answer [s]."""
-LOOK_S = 0.0005
+POLL_S = 0.0005
 SILENT_NS = 20_000_000
 """Time without a sample after which the plant's process is checked [ns]."""
 
@@ -182,7 +182,7 @@ class PlantDriver:
         """Make the plant set up its drives, without power; also finds a restarted plant. Raises DriverError."""
         until_ns = self._clock.now_ns() + round(APPEARS_S * 1e9)
         while True:
-            state = self._look()
+            state = self._poll()
             if state is not None and self._lives():
                 self._failures = state.failures
                 try:
@@ -198,7 +198,7 @@ class PlantDriver:
                     "supervisor: try again",
                     retry=True,
                 )
-            self._sleep(LOOK_S)
+            self._sleep(POLL_S)
 
     def activate(self) -> None:
         """Power on, at rest. Raises DriverError."""
@@ -239,7 +239,7 @@ class PlantDriver:
                     f"the process of the simulated drives did not answer for {CALL_S:g} s; is the computer overloaded?",
                     retry=True,
                 )
-            self._sleep(LOOK_S)
+            self._sleep(POLL_S)
         self._raise_failure(state)
 
     # -- motion ---------------------------------------------------------------------------------------------
@@ -312,7 +312,7 @@ class PlantDriver:
         if not self._closed:  # `stop` may be called after `close`; the power is off then
             self._writer.write(self._orders.encoded())
 
-    def _look(self) -> PlantState | None:
+    def _poll(self) -> PlantState | None:
         """The newest state of any plant; None before the first."""
         record = self._reader.poll()
         if record is not None:
@@ -324,7 +324,7 @@ class PlantDriver:
 
     def _state_of_session(self) -> PlantState:
         """The newest state of the configured plant. Raises DriverError if it has ended."""
-        state = self._look()
+        state = self._poll()
         if state is None or state.session != self._orders.session or not self._lives():
             raise DriverError(
                 ENDED,

@@ -312,10 +312,10 @@ def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
 
     root = fit.root
     slopes = np.zeros((len(vector(np.zeros(len(root)))), len(root)))
-    for j, spread in enumerate(np.linalg.norm(root, axis=1)):
+    for j, sigma in enumerate(np.linalg.norm(root, axis=1)):
         step = np.zeros(len(root))
-        step[j] = 1e-3 * spread
-        slopes[:, j] = (vector(step) - vector(-step)) / (2e-3 * spread)
+        step[j] = 1e-3 * sigma
+        slopes[:, j] = (vector(step) - vector(-step)) / (2e-3 * sigma)
     half = slopes @ root
     covariance = half @ half.T
     names = [f"{camera.name}.{name}" for camera in fit.views.cameras for name in INTRINSICS]

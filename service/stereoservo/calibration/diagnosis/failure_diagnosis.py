@@ -59,14 +59,16 @@ PLAIN = frozenset(
 """Codes that already name the cause."""
 STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
 """Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that adapts to it."""
-MISFITS = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
+UNEXPLAINED = frozenset(
+    {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
+)
 """Codes of contradictory data: the misfit may show the cause."""
 LASTING = frozenset({"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"})
 """Codes of lasting changes during the trials."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Limits of outliers of the lenient fit that is used to explain them."""
 
-APART = 0.1
+MOVED_FRACTION = 0.1
 """Distance of a joint from its median, relative to its range over the trials, from which it counts as displaced."""
 LEAST_TOGETHER = 4
 """Number of stops with several displaced joints that is sufficient to test their combined effect."""
@@ -103,7 +105,7 @@ def diagnose_failure(
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
         return _contradiction_error(trials, error)
-    return _outlier_error(trials, error, refit, options) if error.code in MISFITS else error
+    return _outlier_error(trials, error, refit, options) if error.code in UNEXPLAINED else error
 
 
 def _first_cause(
@@ -256,7 +258,7 @@ def untested_properties(trials: TrialData) -> tuple[str, ...]:
     only move one at a time, from one configuration.
     """
     n = len(trials.joint_names)
-    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
+    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > MOVED_FRACTION * np.ptp(
         trials.positions, axis=0
     )
     together = int(((trials.trials < 0) & (displaced.sum(axis=1) > 1)).sum())
