@@ -54,12 +54,12 @@ def safety_stage(inputs, limits):
     positions, acceleration or braking acted; then the joint that must brake does so fully, at the cost of direction.
     """
     limited, acted = np.empty(3), np.empty(3)
-    requested = MotionRequest(
+    wanted = MotionRequest(
         inputs.raw, inputs.positions, inputs.previous, inputs.brake, inputs.dt_s, inputs.joint_age_s,
         inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
     )  # fmt: skip
-    reported, found = limit_velocity(requested, Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted)
-    return explained(inputs, limits, limited, found, acted) if reported else SafetyResult(inputs.raw, limited)
+    told, found = limit_velocity(wanted, Bounds(limits.table, limits.bounds, limits.keep_outs), limited, acted)
+    return explained(inputs, limits, limited, found, acted) if told else SafetyResult(inputs.raw, limited)
 
 
 def codes(result):
@@ -338,11 +338,11 @@ def test_limits_that_cannot_work_are_refused_by_name(changes, text):
 
 
 @pytest.mark.parametrize(("beyond", "told"), [(1e-12, False), (1e-6, True)])
-def test_only_a_change_that_counts_is_told(beyond, reported):
+def test_only_a_change_that_counts_is_told(beyond, told):
     limits = make_limits()
     raw = np.array([limits.acceleration_max[0] * DT * (1.0 + beyond), 0.0, 0.0])
     result = safety_stage(SafetyInputs(raw, np.zeros(3), np.zeros(3), DT, 0.0, 0.0, False), limits)
-    assert (stage.ACCELERATION_LIMITED in codes(result)) == reported
+    assert (stage.ACCELERATION_LIMITED in codes(result)) == told
 
 
 def test_the_shortest_period_gives_reasons_with_numbers():
@@ -400,13 +400,13 @@ def test_the_stage_answers_as_its_plain_description_does():
     seen = set()
     for trial in range(1500):
         limits, inputs = drawn(rng)
-        result, requested = safety_stage(inputs, limits), expected(inputs, limits)
+        result, wanted = safety_stage(inputs, limits), expected(inputs, limits)
         where = f"trial {trial}: {inputs}, {limits}"
-        np.testing.assert_allclose(result.limited, requested.limited, rtol=1e-9, atol=1e-10, err_msg=where)
-        assert result.braking == requested.braking, where
-        reported = [(r.code, r.level, r.subject, r.value, r.threshold) for r in result.reasons]
-        assert [t[:3] for t in reported] == [r[:3] for r in requested.reasons], where
-        for reason, (*_, value, threshold, words) in zip(result.reasons, requested.reasons, strict=True):
+        np.testing.assert_allclose(result.limited, wanted.limited, rtol=1e-9, atol=1e-10, err_msg=where)
+        assert result.braking == wanted.braking, where
+        told = [(r.code, r.level, r.subject, r.value, r.threshold) for r in result.reasons]
+        assert [t[:3] for t in told] == [r[:3] for r in wanted.reasons], where
+        for reason, (*_, value, threshold, words) in zip(result.reasons, wanted.reasons, strict=True):
             assert reason.value == (None if value is None else pytest.approx(value, rel=1e-9, abs=1e-10)), where
             assert reason.threshold == (None if threshold is None else pytest.approx(threshold)), where
             assert words in reason.hint, where
@@ -453,12 +453,12 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
             feature_age_s=min(accepted, default=now_ns) * 1e-9,
             speed_scale=source * cell,
         )
-        requested = expected(same, limits)
-        sent = requested.limited if active else np.zeros(3)
+        wanted = expected(same, limits)
+        sent = wanted.limited if active else np.zeros(3)
         np.testing.assert_allclose(block.command, sent, rtol=1e-9, atol=1e-10)
         np.testing.assert_array_equal(result.limited, block.command)
         np.testing.assert_array_equal(result.raw, step.raw)
-        assert [reason.code for reason in result.reasons] == [reason[0] for reason in requested.reasons]
+        assert [reason.code for reason in result.reasons] == [reason[0] for reason in wanted.reasons]
         assert not np.shares_memory(block.command, result.limited)
 
 
@@ -468,5 +468,5 @@ def test_the_limits_are_those_of_the_cell():
     cell = SimpleNamespace(**{name: getattr(limits, name) for name in names})
     made = stage.safety_limits(SimpleNamespace(joint_names=limits.joint_names, limits=cell), 0.07)
     for name in SafetyLimits.__struct_fields__:
-        requested = 0.07 if name == "features_fresh_s" else getattr(limits, name)
-        np.testing.assert_array_equal(getattr(made, name), requested)
+        wanted = 0.07 if name == "features_fresh_s" else getattr(limits, name)
+        np.testing.assert_array_equal(getattr(made, name), wanted)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.core.block import ARRAYS, MOST, SIGHTS, Block, restored
+from stereoservo.core.block import ARRAYS, MOST, OBSERVATIONS, Block, restored
 from stereoservo.core.goals.marker_body import place_now
 
 CELL = {"joints": 3, "cameras": 2, "markers": 5, "rows": 7, "window": 4, "past": 65}
@@ -38,7 +38,7 @@ def test_arrays_lie_packed_in_fields_of_their_own(counts: dict[str, int]) -> Non
 def test_a_block_is_read_as_it_was_written_and_anything_else_refused() -> None:
     block = filled(CELL)
     again = restored(block.kept())
-    for name in SIGHTS:  # which are written out with the cameras
+    for name in OBSERVATIONS:  # which are written out with the cameras
         getattr(again, name)[...] = getattr(block, name)
     assert again.record.tobytes() == block.record.tobytes()
     for name, wrong in (

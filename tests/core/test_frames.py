@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stereoservo.core.estimate import KNOWN, MEASURED, fold_frame, see_frame, workspace
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, model_arrays
 from stereoservo.core.monitor import judge_round
 from stereoservo.core.prediction import HUBER, MODEL_SIGMA_PX, TIMING_SIGMA_S, gate_threshold, improbable
 from stereoservo.core.state import initial_state
@@ -82,7 +82,7 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
         # the estimate
         filtered[camera], seen_s[camera], sigma, accepted = fold(
             filtered[camera], seen_s[camera], t_ns * 1e-9, frame, used[:m], known_s=settings.limits.coast_s + 1.0,
-            filter_s=settings.filter_s, gate=gate, model_px=MODEL_SIGMA_PX, first_px=FIRST_SIGHT_SIGMA_PX, huber=HUBER,
+            filter_s=settings.filter_s, gate=gate, model_px=MODEL_SIGMA_PX, first_px=FIRST_SEEN_SIGMA_PX, huber=HUBER,
         )  # fmt: skip
         assert accepted[OUTLIER] == (used[OUTLIER] and k != 4)
         estimate = block.estimates[camera]

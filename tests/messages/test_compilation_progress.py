@@ -99,7 +99,7 @@ def test_a_daemon_is_waited_for_while_it_compiles(tmp_path: Path, monkeypatch: p
 def test_status_and_log_say_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("stereoservo.daemon.supervisor.TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("stereoservo.daemon.supervisor.REPORT_EVERY_S", 0.0)
     lines = ProgressLines()
     for done in (3, 3, 90):
         _tell(tmp_path, done)
