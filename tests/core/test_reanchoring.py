@@ -265,7 +265,7 @@ def test_play_in_the_joints_is_not_told_as_moved_cameras_and_carries_no_goal_ove
     reason = reason_for(cell, "CAMERAS_OR_ARM")
     assert (reason.level, reason.subject, reason.unit) == ("hold", "left, right", "px")
     assert reason.value > reason.threshold == 0.5
-    for word in ("moved, or the arm stands elsewhere", "play", *REMEDIES):
+    for word in ("moved, or the arm is not where", "play", *REMEDIES):
         assert word in reason.hint
     assert cell.bench.core.state.model.epoch == cell.bench.truth.model.epoch
 
@@ -611,7 +611,7 @@ def test_a_camera_that_stands_where_it_stood_is_known_again_at_rest(cells: Any) 
     cell.bench.truth.cameras[0] = place
     again = cell.until("health", 5.0)
     assert again.name == "ok"
-    assert "stand where they stood" in again.message
+    assert "have not moved" in again.message
     assert [e for e in cell.bench.events if e.kind == "reanchor"] == []
     cell.until("goal_reached", 30.0)
     assert cell.ends(goal) == ["goal_reached"]

@@ -251,7 +251,7 @@ def _check_static(trials: TrialData, static: StaticObservations) -> None:
     if twice:
         raise CalibrationError(
             "bad_data",
-            f"static ids {twice} stand twice, or are markers of the arm, too",
+            f"static ids {twice} occur twice, or are markers of the arm, too",
             key="static",
             ids=twice,
         )

@@ -209,8 +209,8 @@ def joint_task(
 
 
 def limits_task(positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float) -> SecondTask:
-    """Joints away from their limits towards the middle of their ranges, with a velocity that rises with the distance
-    from the middle (`limit_pull`).
+    """Joints away from their limits towards the centre of their ranges, with a velocity that rises with the distance
+    from the centre (`limit_pull`).
     """
     pull, half = limit_pull(positions, lower, upper)
     return SecondTask(np.eye(len(positions)), rate * half * pull, 1.0 / half)

@@ -73,7 +73,7 @@ def body_frame(
     approach = multiply(flat.T, (centre - float((centre * plane_at_infinity).sum()) * centroid)[:, None])[:, 0]
     size = _length(approach, Q)
     if not (size > 0.0 and radius > 1e-9 * size):
-        raise GeometryError("degenerate", "the body has no size, or a camera stands in its middle", radius=radius)
+        raise GeometryError("degenerate", "the body has no size, or a camera is at its centre", radius=radius)
     z = approach / size
     if float((P[2] * (flat * z).sum(axis=1)).sum()) * float(m[2]) > 0.0:
         z = -z
@@ -143,7 +143,7 @@ def _estimated_metric(
     if not values[0] > 1e-9 * values[3]:
         raise GeometryError(
             "degenerate",
-            "right angles cannot be told from this arm and its cameras; give H_projective_to_euclidean",
+            "right angles cannot be determined from this arm and its cameras; give H_projective_to_euclidean",
         )
     estimated: FloatArray = Q / values[3]
     return estimated
@@ -284,7 +284,7 @@ def missing_freedom(
     GeometryError as `mobility` does, and for a motion that is not finite.
     """
     if not np.isfinite(required).all():
-        raise GeometryError("not_finite", f"the wanted motion is not finite: {np.asarray(required).tolist()}")
+        raise GeometryError("not_finite", f"the required motion is not finite: {np.asarray(required).tolist()}")
     n = operators.shape[0]
     E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
     named = rigid_motions(E)

@@ -179,7 +179,7 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
 
 
 class DriveDelays(NamedTuple):
-    """Delays of the joints' drives, and the travel missing apart from them; see `core.monitors.following`.
+    """Delays of the joints' drives, and the travel missing in addition to them; see `core.monitors.following`.
 
     ``delay_s`` (n,): the measured delays, 0 before the measurement and where they are negligible: the median of
     ``samples`` (k, n) [s].

@@ -69,7 +69,7 @@ def describe_cell(
             "auxiliary",
             f"joint driver {cell.joints.driver!r} declares auxiliary joints or outputs "
             f"({', '.join(spec.name for spec in joints.auxiliary)}), and lacks write_auxiliary, read_auxiliary or "
-            "stop_auxiliary: orders would be told as obeyed",
+            "stop_auxiliary: commands would be reported as executed",
         )
     if joints.pacing != "clock":
         raise CellFileError(

@@ -112,7 +112,7 @@ class HeartbeatReader:
 class HangWatch:
     """Watchdog of one process.
 
-    Time is measured from the moment at which the watchdog read a beat, not from the beat itself, so that delays of the
+    Time is measured from the time at which the watchdog read a beat, not from the beat itself, so that delays of the
     watchdog do not count as a hang.
     """
 

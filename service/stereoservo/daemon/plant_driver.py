@@ -1,8 +1,8 @@
 """The joint driver of a simulated cell in the servo process: the drives themselves run in the process `plant`, as real
 drives are outside this computer; and the records that the two exchange.
 
-Only the newest record is kept in each direction. `Orders` hold the wanted state and counters of requests, so a missed
-record loses nothing; a plant executes only orders that are addressed to its session, and starts without power.
+Only the newest record is kept in each direction. `Orders` hold the commanded state and counters of requests, so a
+missed record loses nothing; a plant executes only orders that are addressed to its session, and starts without power.
 """
 
 from __future__ import annotations
@@ -249,7 +249,7 @@ class PlantDriver:
         state = self._state_of_session()
         self._raise_failure(state)
         if state.seq == 0:
-            raise DriverError("no_sample", "the simulated drives have told no positions yet", retry=True)
+            raise DriverError("no_sample", "the simulated drives have reported no positions yet", retry=True)
         return state.sample()
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:

@@ -164,7 +164,7 @@ def _behind() -> JointAnglesError:
 def _outside(q: FloatArray, bounds: FloatArray) -> JointAnglesError:
     return JointAnglesError(
         "outside_limits",
-        f"the pixels say {np.round(q, 4).tolist()}, outside of the limits {bounds.tolist()}",
+        f"the pixels give {np.round(q, 4).tolist()}, outside of the limits {bounds.tolist()}",
         q=q.tolist(),
         limits=bounds.tolist(),
     )
@@ -464,8 +464,8 @@ def _refuse_undetermined(problem: JointProblem, q: FloatArray, largest: float) -
     if open_joints:
         raise JointAnglesError(
             "not_observable",
-            f"the images do not tell joint(s) {', '.join(open_joints)}: standard deviation above {largest:g}. More "
-            "points, points farther from their axes, or another stop are needed",
+            f"the images do not determine joint(s) {', '.join(open_joints)}: standard deviation above {largest:g}. "
+            "More points, points farther from their axes, or another stop are needed",
             joints=open_joints,
             deviations=[float(d) if d < 1e6 else None for d in deviations],
             maximum=largest,

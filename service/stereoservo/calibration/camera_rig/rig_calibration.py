@@ -38,7 +38,7 @@ CENTRE_DEVIATION = 0.03
 PAIR_DEVIATION = 1.0
 """Standard deviation of the rotation between two cameras [°] above which it counts as undetermined."""
 OUTSIDE = 0.5
-"""Distance of a principal point from the middle [image sizes] beyond which the model is implausible."""
+"""Distance of a principal point from the centre [image sizes] beyond which the model is implausible."""
 MOST_LEFT_OUT = 0.2
 """Largest share of rejected measurements."""
 MOST_NOISE = 2.0

@@ -91,7 +91,7 @@ def _angle(D: FloatArray) -> float:
 
 
 class Snapshot(NamedTuple):
-    """Measurements of one moment: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
+    """Measurements of one instant: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
     their predicted ``pixels`` and ``observed`` ones (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators``
     (n, 4, 4) and the ``twists`` (6 or 0, 4, 4) of a metric model.
     """

@@ -176,7 +176,7 @@ def _outlier_error(trials: TrialData, error: CalibrationError, refit: Refit, opt
         )
     return CalibrationError(
         error.code,
-        f"{error.message}. Not told apart: positions reported wrongly or at another time than the images, play, "
+        f"{error.message}. Not distinguished: positions reported wrongly or at another time than the images, play, "
         "a camera or marker that moved more than once, many wrong detections",
         **error.data,
     )
@@ -187,7 +187,7 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
     return CalibrationError(
         "views_unrelated",
         f"cameras {names[0]!r} and {names[1]!r} agree on no epipolar geometry, not even within single trials: they do "
-        "not see the same markers at the same time. Do they look at two arms, are ids mixed up, are images late?",
+        "not see the same markers at the same time. Do they see two arms, are ids mixed up, are images late?",
         cameras=names,
     )
 
@@ -248,7 +248,8 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
                 first = trials.joint_names[trials.joint_kinds.index("prismatic")]
                 notes.append(
                     f"joint {trials.joint_names[ratio.joint]!r} reports {ratio.factor:.5g} ± {ratio.deviation:.1g} "
-                    f"times what joint {first!r} does for the same way: check the drives' scales. The model absorbs it"
+                    f"times what joint {first!r} does for the same travel: check the drives' scales. The model "
+                    "absorbs it"
                 )
     return tuple(notes)
 

@@ -12,7 +12,7 @@ the centre moves the fraction ``s`` of its straight line. A camera at ``O`` sees
 interval, and a path with monotonic ``s`` and ``t`` exists if the largest lower bound so far never exceeds the upper
 one. This determines how far the translation may go before the rotation has caught up, how far the rotation may go
 before the translation has, and in which of its two directions the rotation is possible at all: the shorter rotation may
-violate visibility; the longer one is then taken.
+violate visibility; the longer one is then used.
 """
 
 from __future__ import annotations
@@ -612,7 +612,7 @@ def cartesian_reasons(
         elif codes[i] == WAITS and stuck:
             hint = (
                 "translation and turn wait for each other, or a camera would see the face's back: use the law "
-                "trajectory, whose way may bend, or another centre"
+                "trajectory, whose path may bend, or another centre"
             )
             reasons.append(Reason("VISIBILITY_BLOCKED", "hold", component, left, may, in_unit, hint))
         elif codes[i] == WAITS:

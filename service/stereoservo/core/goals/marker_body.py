@@ -288,7 +288,7 @@ def _refine(
     refinements: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4), their pixels (c, m, 2), whether it
-    has converged. ``goal``: set-points (c, m, 2), and which are wanted (c, m).
+    has converged. ``goal``: set-points (c, m, 2), and which are required (c, m).
     """
     set_points, required = goal
     D = displacement

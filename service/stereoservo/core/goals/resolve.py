@@ -131,7 +131,7 @@ def _triangulated(goal: GoalResolution, place: BodyState) -> None:
 
 
 def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
-    """Set-points (c, m, 2) as ideal pixels and wanted ones (c, m), of a target in raw pixels.
+    """Set-points (c, m, 2) as ideal pixels and required ones (c, m), of a target in raw pixels.
 
     Raises RefusalError for an impossible camera, marker or pixel.
     """

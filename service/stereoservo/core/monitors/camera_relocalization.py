@@ -117,12 +117,12 @@ def reasons(state: CoreState) -> tuple[Reason, ...]:
     doing = {
         "brake": "the arm comes to rest",
         "collect": "looking at rest",
-        "wait": "it is being found anew",
+        "wait": "it is being relocalized",
         "take": "its new place is taken over",
         "verify": "its new place is verified",
     }[run.phase]
     if run.doubt:
-        return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to look once more"),)
+        return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to collect more frames"),)
     return (
         Reason(
             "CAMERA_MOVED",
@@ -144,7 +144,7 @@ def rejection_reason(state: CoreState, update: ModelUpdate) -> str:
     """Why a relocalized model is not the expected one; empty if it is."""
     run, model = state.reanchoring, state.model
     if run is None or model is None or run.phase != "wait":
-        return "no cameras are being found anew, or they have moved again since"
+        return "no cameras are being relocalized, or they have moved again since"
     if set(update.reanchored) != set(run.cameras):
         return f"it is re-anchored for {', '.join(update.reanchored)}; {', '.join(run.cameras)} moved"
     same = np.array_equal(update.model.plane_at_infinity, model.plane_at_infinity) and np.array_equal(
@@ -224,7 +224,7 @@ def refused(command: ReanchorRefused, context: StepContext) -> str:
     """The fit could not determine the cameras. Raises RefusalError if no fit was requested."""
     run = context.state.reanchoring
     if run is None or run.phase != "wait":
-        raise RefusalError("NOT_AWAITED", "no cameras are being found anew")
+        raise RefusalError("NOT_AWAITED", "no cameras are being relocalized")
     _fail(run, context, command.message, command.value, command.unit, command.threshold)
     return "the cameras stay unknown"
 
@@ -345,7 +345,7 @@ def _collect(run: Relocalization, context: StepContext) -> None:
         trial=run.poses,
         cameras=run.cameras,
         rigid=run.together,
-        message=f"{named(run.cameras)} seen at rest: to be found anew",
+        message=f"{named(run.cameras)} seen at rest: to be relocalized",
     )
     run.poses += 1
     _enter(run, "wait", context)
@@ -390,8 +390,8 @@ def _where_they_were(run: Relocalization, context: StepContext) -> bool:
         "health",
         id=goal,
         name="ok",
-        message=f"{named(run.cameras)}, seen at rest, stand where they stood: what was seen in motion was of other "
-        f"moments than stated, or passed by{on}",
+        message=f"{named(run.cameras)}, seen at rest, have not moved: what was seen in motion was of other "
+        f"instants than stated, or passed by{on}",
     )
     return True
 
@@ -422,8 +422,8 @@ def _fail(
     limit: float | None = None,
 ) -> None:
     hint = (
-        f"{named(run.cameras)} moved and could not be found anew: {why}. It is tried again when more is seen, when the "
-        "arm rests elsewhere, and on resume; or cancel the goal and calibrate"
+        f"{named(run.cameras)} moved and could not be relocalized: {why}. It is tried again when more is seen, when "
+        "the arm rests elsewhere, and on resume; or cancel the goal and calibrate"
     )
     reason = Reason("REANCHOR_FAILED", "hold", ", ".join(run.cameras), value, limit, unit, hint)
     _give_up(run, context, reason)

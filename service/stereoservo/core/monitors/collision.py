@@ -127,11 +127,11 @@ def worst_contact(
     name = settings.joint_names[joint]
     assert settings.contact is not None  # otherwise there were no limits
     remedy = "is something in its way? Clear it, or resume and jog away from it; where nothing was, "
-    remedy += "raise safety.contact." if learning else "calibrate anew, or raise safety.contact."
+    remedy += "raise safety.contact." if learning else "calibrate again, or raise safety.contact."
     if effort:
         value, limit = float(efforts[joint]), float(effort_limits[joint])
         unit = settings.contact.effort_units[joint]
-        hint = f"joint {name} pushes with {value:.4g} {unit} more than a moment before, {limit:.4g} is allowed: "
+        hint = f"joint {name} pushes with {value:.4g} {unit} more than just before, {limit:.4g} is allowed: "
         return Reason("CONTACT_EFFORT", "hold", name, value, limit, unit, f"{hint}{remedy}effort")
     value, limit = float(following[joint]), float(following_limits[joint])
     unit = settings.joint_unit(joint)

@@ -107,7 +107,7 @@ def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fres
         camera_relocalization.begin(verdict, context)
         return
     state.readiness = ModelReadiness.SUSPECT
-    hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
+    hint = f"{verdict.text}; it is not relocalized automatically ([servo] reanchor): calibrate"
     context.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
     if source.runs_law:
         yield Finding("abort", reason, hint)

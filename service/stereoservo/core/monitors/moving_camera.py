@@ -101,7 +101,7 @@ def start(
             "warning",
             name=names,
             message=f"mobile: {names} cannot be adjusted while it moves, for the model is not metric: it is treated "
-            "like a camera that stands, and found anew at rest",
+            "like a camera that stands, and relocalized at rest",
         )
 
 
@@ -413,8 +413,8 @@ def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
     if len(doubtful) == len(names):
         px = max(mobile.moved_px for mobile in doubtful)
         hint = (
-            f"{named(names)} shows the arm {px:.3g} px rms from where its joints say: either the camera moved, or the "
-            "arm stands elsewhere than its joints say (play, joint zeros, the marker body); no camera that stands sees "
+            f"{named(names)} shows the arm {px:.3g} px rms from where its joints report: either the camera moved, or "
+            "the arm is not where its joints report (play, joint zeros, the marker body); no camera that stands sees "
             f"the arm, and no {FEWEST_STATIC} static points moved. {REMEDIES}, and a camera that stands and sees the "
             "arm"
         )

@@ -502,7 +502,7 @@ GOLDEN = 0.6180339887498949
 UNEVEN_STEP = 0.5
 """Largest fraction of a step by which the stops of a single joint are moved towards the base."""
 SHARE, UNEVEN = 0.8, 0.5
-"""Largest offset of a joint from the middle of its range, as a fraction of half the range in which it was driven; and
+"""Largest offset of a joint from the centre of its range, as a fraction of half the range in which it was driven; and
 the fraction of this offset by which stops differ, so that a gear's ripple does not repeat and errors that grow with the
 range become visible.
 """
@@ -702,7 +702,7 @@ def too_little(
     wider = (
         f"raise calibration.range.{name}"
         if stated
-        else "put the base where this joint has more room before the border of a view or its limit"
+        else "put the base where this joint has more range before the border of a view or its limit"
     )
     at_stops, least_stops = ("", "") if stops is None else (f"at {stops} stops ", f"{MIN_STOPS} stops over ")
     if (stops is not None and stops < MIN_STOPS) or visited < settings.min_range:

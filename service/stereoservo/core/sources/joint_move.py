@@ -82,8 +82,8 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
         if share is not None:
             raise RefusalError(
                 "KEEP_OUT",
-                f"the straight way in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a goal "
-                "beside it",
+                f"the straight path in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a "
+                "goal beside it",
                 subject=name,
                 value=share,
                 threshold=1.0,

@@ -87,7 +87,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
         scene = scene._replace(camera_centres=arrays.camera_centres)
     if law.planned:
         if source.plan is None and source.pose_known:
-            hint = "the way is planned from where the arm comes to rest"
+            hint = "the path is planned from where the arm comes to rest"
             waits = Reason("PLANNING", "slow", hint=hint)
             return SourceOutput(np.zeros_like(context.q), error_px=error_px, reasons=(waits,))
         if source.plan is not None:

@@ -58,7 +58,7 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
         able = [repr(name) for name in LAWS.surest_first() if LAWS[name].follows_streams]
         raise RefusalError(
             "LAW_CANNOT_FOLLOW",
-            f"law {source.law!r} follows a way that was planned for a goal that stands; stream with "
+            f"law {source.law!r} follows a path that was planned for a static goal; stream with "
             f"{', '.join(able[:-1])} or {able[-1]}",
             subject=source.law,
         )

@@ -48,7 +48,7 @@ def require_followable(goal: Goal, follows_streams: bool, law: str, pose_known: 
     if not follows_streams:
         raise RefusalError(
             "LAW_CANNOT_FOLLOW",
-            f"law {law!r} follows a way that was planned for a goal that stands",
+            f"law {law!r} follows a path that was planned for a static goal",
             subject=law,
         )
     if not pose_known:
@@ -260,7 +260,7 @@ def _not_found(source: Follower, body: TargetBody | None, context: StepContext) 
         f"left, {FOUND_REST_PX:g} px is allowed; it is another part, or one of its markers slipped"
     )
     if context.arrays is None or context.arrays.to_euclidean is None:
-        hint += ", or it has turned by 60 degrees and more, which only a metric model tells"
+        hint += ", or it has turned by 60 degrees and more, which only a metric model distinguishes"
     return Reason("TARGET_DIFFERS", "hold", ids, body.rest_px, FOUND_REST_PX, "px", hint)
 
 
