@@ -14,7 +14,7 @@ from stereoservo.core import command as stage
 from stereoservo.core.block import Block, views
 from stereoservo.core.command import (
     Bounds,
-    MotionRequest,
+    Requested,
     SafetyConfigurationError,
     SafetyInputs,
     SafetyLimits,
@@ -54,7 +54,7 @@ def safety_stage(inputs, limits):
     positions, acceleration or braking acted; then the joint that must brake does so fully, at the cost of direction.
     """
     limited, acted = np.empty(3), np.empty(3)
-    wanted = MotionRequest(
+    wanted = Requested(
         inputs.raw, inputs.positions, inputs.previous, inputs.brake, inputs.dt_s, inputs.joint_age_s,
         inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
     )  # fmt: skip

@@ -52,8 +52,7 @@ REMEDIES = {
     "bad_file": "the file holds no cameras, or what the wished format cannot hold: read the text",
     "length": "state the distance of two markers that were seen, in metres",
     "model_does_not_fit": "the model was not refined on-line: `calibrate --check` reports what changed",
-    "step_too_large": "the model was not refined on-line: `calibrate --check` reports what changed; else calibrate "
-    "again",
+    "step_too_large": "the model was not refined on-line: `calibrate --check` reports what changed; else calibrate",
     "not_better": "the model in use stays: nothing is to be done",
     "no_covariance": "calibrate again: a refinement starts from the covariance of a calibration",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
@@ -73,8 +72,7 @@ REMEDIES = {
     "too_many_outliers": "check the tracks of the joint named: reflections, mixed-up markers, another joint moving",
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
-    "noise_understated": "raise the detector's sigma to the value in the text; check whether images are dark or "
-    "blurred",
+    "noise_understated": "raise the detector's sigma to the value in the text; are the images dark or blurred?",
     "joints_inexact": "check for play, a loose coupling or a damaged encoder in the joints named; larger motions "
     "(calibration.range) make such errors smaller beside them",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",

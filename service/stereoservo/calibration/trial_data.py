@@ -388,9 +388,7 @@ def _static_arrays(static: StaticObservations | None) -> dict[str, npt.NDArray[A
 
 
 def _path_arrays(paths: PathObservations | None) -> dict[str, npt.NDArray[Any]]:
-    return (
-        {} if paths is None else {PATHS + field: getattr(paths, field) for field in PathObservations.__struct_fields__}
-    )
+    return {} if paths is None else {PATHS + key: getattr(paths, key) for key in PathObservations.__struct_fields__}
 
 
 def _paths_of(arrays: dict[str, npt.NDArray[Any]]) -> PathObservations | None:

@@ -59,7 +59,7 @@ def body_frame(
     centroid = (points / (points * plane_at_infinity).sum(axis=1)[:, None]).mean(axis=0)
     flat = _directions(plane_at_infinity)
     if H_projective_to_euclidean is None:
-        Q = _estimated_metric(generators, matrices, centroid, flat)
+        Q = _estimate_metric(generators, matrices, centroid, flat)
     else:
         axes = multiply(H_projective_to_euclidean[:3], flat)
         Q = multiply(axes.T, axes)
@@ -111,7 +111,7 @@ def _directions(plane_at_infinity: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.delete(reflection, k, axis=1))
 
 
-def _estimated_metric(
+def _estimate_metric(
     generators: FloatArray, matrices: FloatArray, centroid: FloatArray, flat: FloatArray
 ) -> FloatArray:
     """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for rotations ``R``."""

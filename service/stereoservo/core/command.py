@@ -57,7 +57,7 @@ def command(block: Record, workspace: Record, keep_outs: FloatArray) -> None:
     _foresee(block, workspace)
     work.previous[:n] = sent
     limits = Bounds(work.limits[: 4 * n].reshape((4, n)), work.bounds, keep_outs)
-    requested = MotionRequest(
+    requested = Requested(
         raw, work.outermost[:n], work.previous[:n], work.paused != 0, work.dt_s,
         (work.now_ns - memory.last_joints_ns) * 1e-9, feature_age_s, work.needs_features != 0, work.speed_scale,
     )  # fmt: skip
@@ -591,7 +591,7 @@ def _velocity_scale(
     return scale, scaled_by
 
 
-class MotionRequest(NamedTuple):
+class Requested(NamedTuple):
     """The requested motion: ``raw`` velocity, joint ``positions`` and the ``previous`` command, (n,) each; the other
     fields as in `SafetyInputs`.
     """
@@ -629,9 +629,7 @@ class LimitsFound(NamedTuple):
 
 
 @kernel
-def limit_velocity(
-    motion: MotionRequest, by: Bounds, limited: FloatArray, acted: FloatArray
-) -> tuple[bool, LimitsFound]:
+def limit_velocity(motion: Requested, by: Bounds, limited: FloatArray, acted: FloatArray) -> tuple[bool, LimitsFound]:
     """Apply staleness, braking, velocity, position, keep-out and acceleration limits, in this order. Returns whether
     there is anything to report, and the `LimitsFound`.
 

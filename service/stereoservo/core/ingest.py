@@ -298,12 +298,10 @@ def frame_timeout_s(settings: CoreSettings) -> float:
 
 def put_inputs(context: StepContext) -> None:
     """Write the step's inputs into the workspace."""
-    inputs, workspace = context.inputs, context.derived.workspace
-    has_sent = (
-        inputs.sent is not None and inputs.sent.shape == workspace.sent.shape and bool(np.isfinite(inputs.sent).all())
-    )
+    inputs, workspace, sent = context.inputs, context.derived.workspace, context.inputs.sent
+    has_sent = sent is not None and sent.shape == workspace.sent.shape and bool(np.isfinite(sent).all())
     if has_sent:
-        workspace.sent[:] = inputs.sent
+        workspace.sent[:] = sent
     frames = newest_frames(inputs) if inputs.observations else ()
     for k, frame in enumerate(frames):
         camera = context.derived.cameras.get(frame.camera, -1)

@@ -86,11 +86,8 @@ def observe(context: StepContext, *, decides: bool) -> int:
         estimate(record, space)
         if block.numbers.history_count:
             context.arrays = context.moved_arrays or derived.arrays
-            context.prediction, context.weights, context.pixels = (
-                workspace.prediction,
-                workspace.weights,
-                workspace.pixels,
-            )
+            context.prediction, context.weights = workspace.prediction, workspace.weights
+            context.pixels = workspace.pixels
     found |= detect(record, space)
     context.stays_active = bool(work.has_goal) and not found and not decides and follow_goal(record, space)
     return found

@@ -351,8 +351,7 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
             raise ModelFileError(
                 path,
                 f"cameras[{i}].lens",
-                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_DISTORTION:g} of either sign is "
-                "accepted",
+                f"{camera.name!r}: distortion parameter {strongest:g}; at most ±{MAX_DISTORTION:g} is accepted",
             )
         # Rows of unit length: the result is the rank, independent of units.
         rows = np.linalg.norm(camera.matrix, axis=1)

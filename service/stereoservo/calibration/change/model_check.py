@@ -562,8 +562,7 @@ def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> N
                 raise CalibrationError(
                     "not_observable",
                     f"the check does not distinguish a drift of {cause.subject} from one of {other.subject}: at "
-                    "these stops both move the markers alike. Take a base where their axes are different lines, or "
-                    "calibrate again",
+                    "these stops both move the markers alike. Take a base where their axes differ, or calibrate again",
                     joints=[cause.subject, other.subject],
                 )
 

@@ -59,9 +59,7 @@ PLAIN = frozenset(
 """Codes that already name the cause."""
 STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
 """Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that adapts to it."""
-UNEXPLAINED = frozenset(
-    {"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"}
-)
+MISMATCH = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
 """Codes of contradictory data: the misfit may show the cause."""
 LASTING = frozenset({"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"})
 """Codes of lasting changes during the trials."""
@@ -105,7 +103,7 @@ def diagnose_failure(
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
         return _contradiction_error(trials, error)
-    return _outlier_error(trials, error, refit, options) if error.code in UNEXPLAINED else error
+    return _outlier_error(trials, error, refit, options) if error.code in MISMATCH else error
 
 
 def _first_cause(
@@ -248,8 +246,7 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
                 first = trials.joint_names[trials.joint_kinds.index("prismatic")]
                 notes.append(
                     f"joint {trials.joint_names[ratio.joint]!r} reports {ratio.factor:.5g} ± {ratio.deviation:.1g} "
-                    f"times what joint {first!r} does for the same travel: check the drives' scales. The model "
-                    "absorbs it"
+                    f"times what joint {first!r} does for equal travel: check the drives' scales. The model absorbs it"
                 )
     return tuple(notes)
 

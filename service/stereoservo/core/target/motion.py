@@ -467,14 +467,9 @@ def find_stated(
 
 @kernel
 def find_pose(
-    basis: FloatArray,
-    matrices: FloatArray,
-    start: FloatArray,
-    points: FloatArray,
-    observed: FloatArray,
-    seen: FloatArray,
+    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, shown: FloatArray, seen: FloatArray
 ) -> tuple[FloatArray, float]:
-    """The displacement (4, 4) of ``points`` (k, 4) that explains ``observed`` (c, k, 2), where ``seen`` (c, k), from a
+    """The displacement (4, 4) of ``points`` (k, 4) that explains ``shown`` (c, k, 2), where ``seen`` (c, k), from a
     ``start`` (4, 4), and its residual [px] rms.
 
     Least squares from a distant start converges to a wrong pose: for rotations of 60 degrees and more.
@@ -485,14 +480,14 @@ def find_pose(
         moved = transform_points(D, points)
         pixels, _ = project_points(matrices, moved)
         J = image_jacobian(basis, matrices, moved).reshape((-1, basis.shape[0]))
-        step, _ = damped_least_squares(J, (observed - pixels).reshape(-1), weights, 1e-9)
+        step, _ = damped_least_squares(J, (shown - pixels).reshape(-1), weights, 1e-9)
         D = displaced(D, basis, step)
     pixels, _ = project_points(matrices, transform_points(D, points))
     total = count = 0.0
     for c in range(seen.shape[0]):
         for i in range(seen.shape[1]):
             if seen[c, i] > 0.0:
-                total += (observed[c, i, 0] - pixels[c, i, 0]) ** 2 + (observed[c, i, 1] - pixels[c, i, 1]) ** 2
+                total += (shown[c, i, 0] - pixels[c, i, 0]) ** 2 + (shown[c, i, 1] - pixels[c, i, 1]) ** 2
                 count += 2.0
     rest = math.sqrt(total / count) if count > 0.0 else math.inf
     return D, rest if math.isfinite(rest) else math.inf
