@@ -175,7 +175,7 @@ def test_a_scale_that_gears_may_imitate_is_reported_as_either():
     [told] = [note for note in result.report.notes if note.startswith("joint 'j3' reports 1.0")]
     factor, _, deviation = told.removeprefix("joint 'j3' reports ").split(" ")[:3]
     assert abs(float(factor) - 1.03) < 4.5 * float(deviation) < 0.02
-    assert "its drive's scale may be wrong, or it gives way under its load" in told
+    assert "its drive's scale may be wrong, or it yields under its load" in told
     assert result.model.joint_accuracy.posture.argmax() == 2
     said = assess_fit(result.model, result.report)
     assert said.grade == "usable"

@@ -8,8 +8,8 @@ import pytest
 
 from stereoservo.calibration.trial_data import (
     CalibrationError,
+    PathObservations,
     TrialCamera,
-    WayObservations,
     check_trials,
     decode_trials,
     encode_trials,
@@ -65,7 +65,7 @@ def seen_on_the_way(trials, frames=5, samples=9, seen=3):
     rng = np.random.default_rng(2)
     pixels = rng.uniform(0.0, 480.0, (frames, seen, 2))
     pixels[1, 2] = np.nan
-    return WayObservations(
+    return PathObservations(
         ways=np.arange(frames) // 2, cameras=np.arange(frames) % 2, times=rng.uniform(0.0, 9.0, frames),
         markers=np.full((frames, seen), trials.marker_ids[0]), pixels=pixels, joint_ways=np.zeros(samples, np.int64),
         joint_times=np.linspace(0.0, 9.0, samples), positions=rng.normal(size=(samples, len(trials.joint_names))),
@@ -76,7 +76,7 @@ def test_what_was_seen_on_the_path_comes_back_and_may_be_missing(trials):
     assert decode_trials(encode_trials(trials)).way is None
     way = seen_on_the_way(trials)
     again = decode_trials(encode_trials(wrong(trials, way=way))).way
-    for field in WayObservations.__struct_fields__:
+    for field in PathObservations.__struct_fields__:
         assert np.array_equal(getattr(again, field), getattr(way, field), equal_nan=field == "pixels"), field
     for words, field, array in (
         ("way_positions has shape", "positions", way.positions[:, 1:]),

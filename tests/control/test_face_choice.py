@@ -19,8 +19,8 @@ from stereoservo.control.faces import (
     choose_triangle,
     kept_faces,
     law_scene,
-    spread_in_images,
-    triangle_sight,
+    spaced_in_images,
+    triangle_view,
     visibility_along,
 )
 from stereoservo.control.law import Options
@@ -45,11 +45,11 @@ def test_the_choice_is_seen_and_large_and_stays(virtual):
             continue
         assert np.isfinite(scene.points[choice.triple]).all()
         assert set(choice.triple.tolist()) <= set(names[choice.face])
-        cameras, area = triangle_sight(*choice.triple, scene.pixels, scene.weights)
+        cameras, area = triangle_view(*choice.triple, scene.pixels, scene.weights)
         area *= LASTING if lasts[choice.triple[0]] else 1.0
         for triple in combinations(range(8), 3):
             if set(triple) <= set(range(4)) or set(triple) <= set(range(4, 8)):
-                others, other = triangle_sight(*triple, scene.pixels, scene.weights)
+                others, other = triangle_view(*triple, scene.pixels, scene.weights)
                 other *= LASTING if lasts[triple[0]] else 1.0
                 assert others < cameras or (others == cameras and other <= CLEARLY_BETTER * area)
         # outward: the cameras that see it are before its front
@@ -243,15 +243,15 @@ def test_many_markers_of_a_face_are_tried_by_those_that_are_spread_out(virtual):
     for count in (MOST_TRIED, 60, 400):
         pixels = np.stack([rng.uniform(0, 400, (count, 2)), rng.uniform(0, 300, (count, 2))])
         weights = np.full((2, count), 10.0)
-        tried = spread_in_images(np.arange(count), pixels, weights)
+        tried = spaced_in_images(np.arange(count), pixels, weights)
         assert len(set(tried.tolist())) == min(count, MOST_TRIED)
         assert (np.diff(tried) > 0).all()
         members, none = np.ones((1, count)), np.zeros(3, np.int64)
         _, triple, cameras = choose_triangle(members, np.zeros(1), np.ones(count), pixels, weights, Triangle(-2, none))
         assert cameras == 2
-        _, area = triangle_sight(*triple, pixels, weights)
+        _, area = triangle_view(*triple, pixels, weights)
         sides = rng.integers(0, count, (3, 20_000))
-        random = max(triangle_sight(*three, pixels, weights)[1] for three in sides.T)
+        random = max(triangle_view(*three, pixels, weights)[1] for three in sides.T)
         assert area >= (0.999 if count == MOST_TRIED else 0.8) * random
         weights[:, triple[0]] = 0.0
         assert (

@@ -14,11 +14,11 @@ from stereoservo.core import command as stage
 from stereoservo.core.block import Block, views
 from stereoservo.core.command import (
     Bounds,
+    Requested,
     SafetyConfigurationError,
     SafetyInputs,
     SafetyLimits,
     SafetyResult,
-    Wanted,
     command,
     explained,
     limit_velocity,
@@ -54,7 +54,7 @@ def safety_stage(inputs, limits):
     positions, acceleration or braking acted; then the joint that must brake does so fully, at the cost of direction.
     """
     limited, acted = np.empty(3), np.empty(3)
-    wanted = Wanted(
+    wanted = Requested(
         inputs.raw, inputs.positions, inputs.previous, inputs.brake, inputs.dt_s, inputs.joint_age_s,
         inputs.feature_age_s, inputs.needs_features, inputs.speed_scale,
     )  # fmt: skip
@@ -442,7 +442,7 @@ def test_a_step_of_the_core_is_limited_as_its_state_and_the_motion_say():
             outermost = np.where(towards > 0.0, np.maximum(step.positions, ahead), np.minimum(step.positions, ahead))
         command(block.record, record, limits.keep_outs)
         context = SimpleNamespace(
-            derived=SimpleNamespace(room=SimpleNamespace(numbers=work, arrays=arrays)),
+            derived=SimpleNamespace(workspace=SimpleNamespace(numbers=work, arrays=arrays)),
             state=SimpleNamespace(block=block), now_ns=now_ns, dt_s=step.dt_s,
         )  # fmt: skip
         result = stage.limited_command(context, limits)

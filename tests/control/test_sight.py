@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from oracles.face_visibility import way_in_sight
-from stereoservo.control.laws.cartesian3 import way_in_sight as kernel
+from oracles.face_visibility import visible_rotation
+from stereoservo.control.laws.cartesian3 import visible_rotation as kernel
 
 
 def problem(virtual, rng, angle=None):
@@ -45,7 +45,7 @@ def test_a_way_is_found_where_a_search_finds_one(virtual):
     clear = {True: 0, False: 0}
     for seed in range(25):
         hidden, theta, seen = problem(virtual, np.random.default_rng(50189 + seed), angle=170.0)
-        way = way_in_sight(*hidden, theta)
+        way = visible_rotation(*hidden, theta)
         short, long = reachable(seen, theta), reachable(seen, theta - 2 * np.pi)
         assert way.clear == (short or long)
         if way.clear:
@@ -63,7 +63,7 @@ def test_the_kernel_is_the_reference(virtual, seed):
     eyes = eyes[: seed % 3]
     for angle in (theta, -theta, 0.0):
         for side in (1.0, -1.0):
-            expected = way_in_sight(face, H, displacement, side * eyes, angle)
+            expected = visible_rotation(face, H, displacement, side * eyes, angle)
             found = kernel(face, H, displacement, eyes, side, angle)
             np.testing.assert_allclose(found[:3], expected[:3], rtol=0, atol=1e-9)
             assert found[3] == expected.clear
@@ -78,7 +78,7 @@ def test_translation_waits_for_the_turn_and_the_turn_for_the_translation(virtual
         normal = np.array([np.sin(phi), 0, -np.cos(phi)])
         face = np.append(normal, -normal @ [x, 0, 1.0])
         turn = np.angle(np.exp(1j * (phi - to_phi)))
-        return way_in_sight(face, virtual.screw([0, 1.0, 0], [x, 0, 1.0]), np.array([to_x - x, 0, 0, 0]), eye, turn)
+        return visible_rotation(face, virtual.screw([0, 1.0, 0], [x, 0, 1.0]), np.array([to_x - x, 0, 0, 0]), eye, turn)
 
     far = np.radians(120.0)
     assert way(-1.0, 0.0, 1.0, 0.0) == (0.0, 1.0, 0.0, True)
@@ -98,6 +98,6 @@ def test_cameras_that_see_the_back_now_or_at_the_end_do_not_count(virtual):
     G = virtual.screw([0, 1.0, 0], [0, 0, 1.0])
     face, still = np.array([0, 0, -1.0, 1.0]), np.zeros(4)
     ahead, behind = np.array([[0, 0, 0, 1.0]]), np.array([[0, 0, 3.0, 1.0]])
-    assert way_in_sight(face, G, still, ahead, np.pi) == (np.pi, 1.0, np.pi, True)
-    assert way_in_sight(face, G, still, behind, 0.3) == (0.3, 1.0, 0.3, True)
-    assert way_in_sight(face, G, still, np.zeros((0, 4)), 0.3) == (0.3, 1.0, 0.3, True)
+    assert visible_rotation(face, G, still, ahead, np.pi) == (np.pi, 1.0, np.pi, True)
+    assert visible_rotation(face, G, still, behind, 0.3) == (0.3, 1.0, 0.3, True)
+    assert visible_rotation(face, G, still, np.zeros((0, 4)), 0.3) == (0.3, 1.0, 0.3, True)

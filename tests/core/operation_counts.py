@@ -44,10 +44,10 @@ def mark_kernels() -> None:
 
 def part_by_attribute(core: Any) -> None:
     """Let kernels as Python have the records of a core's block and workspace as compiled ones do."""
-    block, room = core.state.block, core._derived.room
-    vars(block)["record"], vars(room)["record"] = (
+    block, workspace = core.state.block, core._derived.workspace
+    vars(block)["record"], vars(workspace)["record"] = (
         block.record.view(np.recarray),
-        room.record.view(np.recarray),
+        workspace.record.view(np.recarray),
     )
 
 

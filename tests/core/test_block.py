@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stereoservo.core.block import ARRAYS, MOST, SIGHTS, Block, restored
+from stereoservo.core.block import ARRAYS, MOST, OBSERVATIONS, Block, restored
 from stereoservo.core.goals.marker_body import place_now
 
 CELL = {"joints": 3, "cameras": 2, "markers": 5, "rows": 7, "window": 4, "past": 65}
@@ -38,7 +38,7 @@ def test_arrays_lie_packed_in_fields_of_their_own(counts: dict[str, int]) -> Non
 def test_a_block_is_read_as_it_was_written_and_anything_else_refused() -> None:
     block = filled(CELL)
     again = restored(block.kept())
-    for name in SIGHTS:  # which are written out with the cameras
+    for name in OBSERVATIONS:  # which are written out with the cameras
         getattr(again, name)[...] = getattr(block, name)
     assert again.record.tobytes() == block.record.tobytes()
     for name, wrong in (
@@ -52,7 +52,7 @@ def test_a_block_is_read_as_it_was_written_and_anything_else_refused() -> None:
 def test_what_a_goal_keeps_of_a_step_does_not_change_with_the_next(bench: Any) -> None:
     bench.ready()
     place = place_now(bench.core._context)
-    room = bench.core._derived.room.prediction
-    np.testing.assert_array_equal(place.operators, room.operators)
+    workspace = bench.core._derived.workspace.prediction
+    np.testing.assert_array_equal(place.operators, workspace.operators)
     for kept in (place.operators, place.points):
-        assert not any(np.shares_memory(kept, array) for array in (room.operators, room.points))
+        assert not any(np.shares_memory(kept, array) for array in (workspace.operators, workspace.points))

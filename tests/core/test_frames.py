@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.core.estimate import KNOWN, TOLD, fold_frame, see_frame, workspace
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays
+from stereoservo.core.estimate import KNOWN, MEASURED, fold_frame, see_frame, workspace
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, model_arrays
 from stereoservo.core.monitor import judge_round
 from stereoservo.core.prediction import HUBER, MODEL_SIGMA_PX, TIMING_SIGMA_S, gate_threshold, improbable
 from stereoservo.core.state import initial_state
@@ -27,7 +27,7 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
     room.arrays["masked"][MASKED] = 1.0
     m, rows = len(arrays.marker_ids), len(arrays.row_ids)
     assert rows == m + 4
-    block.begin_sights(m, rows)
+    block.begin_observations(m, rows)
     ids, masked = np.array([*arrays.marker_ids, *arrays.scene_ids]), np.zeros(m)
     masked[MASKED] = 1.0
     standing = truth.images_of(truth.static)
@@ -52,7 +52,7 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
         shown = rng.permutation(rows)[: rows - 1]  # one is not seen, and they come in any order
         room.put_frame(0, camera, (k, t_ns), (ids[shown], observed[shown], covariances[shown]))
         found = see_frame(block.record, room.record, 0)
-        assert found == KNOWN | TOLD
+        assert found == KNOWN | MEASURED
         fold_frame(block.record, room.record, 0, found)
         assert block.numbers.round_due == (k >= 2)  # none has looked at the frame before
         frame = residuals(observed, predicted, velocity, covariances, TIMING_SIGMA_S)
@@ -82,7 +82,7 @@ def test_frames_are_folded_and_judged_as_by_their_definitions(benches: Any) -> N
         # the estimate
         filtered[camera], seen_s[camera], sigma, accepted = fold(
             filtered[camera], seen_s[camera], t_ns * 1e-9, frame, used[:m], known_s=settings.limits.coast_s + 1.0,
-            filter_s=settings.filter_s, gate=gate, model_px=MODEL_SIGMA_PX, first_px=FIRST_SIGHT_SIGMA_PX, huber=HUBER,
+            filter_s=settings.filter_s, gate=gate, model_px=MODEL_SIGMA_PX, first_px=FIRST_SEEN_SIGMA_PX, huber=HUBER,
         )  # fmt: skip
         assert accepted[OUTLIER] == (used[OUTLIER] and k != 4)
         estimate = block.estimates[camera]

@@ -45,7 +45,7 @@ def test_pixels_and_jacobians_are_those_of_the_reference(lens: tuple[float, ...]
 def test_sights_carry_their_covariance_through_the_inverse(lens: tuple[float, ...]) -> None:
     """Against central differences of the reference's inverse."""
     lens_array, pixels, covariances = np.array(lens), scattered(3), spread(3)
-    ideal, found, seen = prediction.undistort_sights(lens_array, pixels, covariances)
+    ideal, found, seen = prediction.undistort_observations(lens_array, pixels, covariances)
     np.testing.assert_array_equal(seen, np.isfinite(distortion.undistort(lens_array, pixels)).all(axis=1))
     assert seen.sum() > 20
     h = 1e-4
@@ -76,6 +76,6 @@ def test_expected_pixels_carry_velocity_and_covariance(lens: tuple[float, ...]) 
 def test_beyond_the_fold_there_is_nothing() -> None:
     lens = np.array([-0.3, 319.5, 239.5, 320.0])  # folds at 337 px ideal, 225 px raw
     far = np.array([[319.5 + 230.0, 239.5], [np.nan, 1.0], [319.5, 239.5]])
-    assert prediction.undistort_sights(lens, far, spread(0, 3))[2].tolist() == [False, False, True]
+    assert prediction.undistort_observations(lens, far, spread(0, 3))[2].tolist() == [False, False, True]
     far = np.array([[319.5 + 340.0, 239.5], [np.nan, 1.0], [319.5, 239.5]])
     assert report.distort_expected(lens, far, far, spread(0, 3))[3].tolist() == [False, False, True]

@@ -128,7 +128,7 @@ def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches:
         rest = np.zeros_like(arrays.zero)
         block, room = initial_state(bench.settings).block, workspace(bench.settings, None)
         block.history_ns[1], block.history_positions[:2], block.numbers.history_count = 1, rest, 2
-        block.begin_sights(len(arrays.ids), len(arrays.row_ids))
+        block.begin_observations(len(arrays.ids), len(arrays.row_ids))
         room.use(arrays)
         given = observation.ids, observation.pixels, observation.covariances
         room.put_frame(0, 0, (1, 1), given)
@@ -139,7 +139,7 @@ def test_sights_beyond_the_fold_are_dropped_and_pinholes_pass_untouched(benches:
     assert seen == [[True, True, True], [True, False, True]]
     np.testing.assert_allclose(pixels[0], observation.pixels, atol=1e-9)
     np.testing.assert_allclose(pixels[1][0], (320, 240), atol=1e-9)
-    assert np.linalg.det(found.spread[2]) > 1e-4  # a barrel compressed it
+    assert np.linalg.det(found.covariance[2]) > 1e-4  # a barrel compressed it
 
 
 def test_set_point_where_the_lens_images_nothing_is_refused_with_its_value(benches: Any) -> None:

@@ -29,7 +29,7 @@ from stereoservo.core.target.motion import (
     solve_into,
     turns_about,
 )
-from stereoservo.core.target.track import restart, tell_untrackable
+from stereoservo.core.target.track import report_untrackable, restart
 from stereoservo.kinematics.kernels import image_jacobian, project_points, transform_points
 from stereoservo.messages.goals import FeatureTarget, Goal, RunGoal
 
@@ -252,7 +252,7 @@ def test_a_body_said_to_move_that_the_model_cannot_follow_is_told(benches: Any, 
     def emit(kind: str, message: str, reasons: Any) -> None:
         told.append(reasons[0].code)
 
-    tell_untrackable(cast(Any, SimpleNamespace(state=state, settings=settings, emit=emit)))
+    report_untrackable(cast(Any, SimpleNamespace(state=state, settings=settings, emit=emit)))
     assert told == warned
 
 

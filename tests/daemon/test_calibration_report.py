@@ -165,7 +165,7 @@ def test_verdict_names_the_joint_that_moved_too_little(fitted: tuple) -> None:
         JointStatistics(j.name, j.rms_px, j.stops, np.radians(4.0) if j.name == "j3" else j.range)
         for j in result.model.statistics.joints
     )
-    said = assess_fit(changed(result.model, joints=joints), result.report, depth_spread=0.09)
+    said = assess_fit(changed(result.model, joints=joints), result.report, depth_deviation=0.09)
     assert said.grade == "usable"
     assert "depths are known to 9% only; joint j3 moved 4.0° only" in said.text
     assert "Raise calibration.range.j3." in said.text

@@ -46,41 +46,41 @@ def bench(tmp_path: Path) -> Bench:
 
 
 def test_a_process_is_watched_from_its_first_beat_on(bench: Bench) -> None:
-    assert bench.watch.look(1000.0) == ""
+    assert bench.watch.check(1000.0) == ""
     bench.process.beat(2.0)
-    assert bench.watch.look(2000.0) == ""
-    assert bench.watch.look(2001.9) == ""
-    assert bench.watch.look(2002.5) == "it gave no sign of life for 2.5 s (limit 2 s)"
+    assert bench.watch.check(2000.0) == ""
+    assert bench.watch.check(2001.9) == ""
+    assert bench.watch.check(2002.5) == "it gave no sign of life for 2.5 s (limit 2 s)"
 
 
 def test_what_takes_long_is_announced(bench: Bench) -> None:
     bench.process.beat(2.0)
     bench.process.beat(15.0)
-    assert bench.watch.look(1000.0) == ""
-    assert bench.watch.look(1014.0) == ""
+    assert bench.watch.check(1000.0) == ""
+    assert bench.watch.check(1014.0) == ""
     bench.process.beat(2.0)
-    assert bench.watch.look(1015.0) == ""
-    assert "limit 2 s" in bench.watch.look(1017.5)
+    assert bench.watch.check(1015.0) == ""
+    assert "limit 2 s" in bench.watch.check(1017.5)
 
 
 def test_a_watch_that_was_late_begins_anew(bench: Bench) -> None:
     bench.process.beat(2.0)
-    assert bench.watch.look(1000.0) == ""
-    assert bench.watch.look(1009.0, late=True) == ""
-    assert bench.watch.look(1010.9) == ""
-    assert bench.watch.look(1011.2) != ""
+    assert bench.watch.check(1000.0) == ""
+    assert bench.watch.check(1009.0, late=True) == ""
+    assert bench.watch.check(1010.9) == ""
+    assert bench.watch.check(1011.2) != ""
 
 
 def test_a_new_process_is_not_judged_by_the_beats_of_the_one_before(bench: Bench) -> None:
     bench.process.beat(2.0)
     bench.process.close()
     bench.watch.begin()
-    assert bench.watch.look(1000.0) == ""
-    assert bench.watch.look(2000.0) == ""
+    assert bench.watch.check(1000.0) == ""
+    assert bench.watch.check(2000.0) == ""
     process = HeartbeatWriter(bench.path)
     process.beat(2.0)
-    assert bench.watch.look(2001.0) == ""
-    assert bench.watch.look(2004.0) != ""
+    assert bench.watch.check(2001.0) == ""
+    assert bench.watch.check(2004.0) != ""
 
 
 def test_limits_are_those_of_the_page() -> None:
@@ -111,7 +111,7 @@ def test_a_gateway_has_its_longer_limit_while_it_serves_a_request_and_no_longer(
     served = []
 
     def hung_after(seconds: float) -> str:
-        return bench.watch.look(clock[0] + seconds)
+        return bench.watch.check(clock[0] + seconds)
 
     def serve(query: object) -> None:
         clock[0] += 1000.0
@@ -193,7 +193,7 @@ class Watched:
                 if name != silent:
                     beat._due_ns = 0
                     beat.beat(2.0)
-            self.supervisor.look(self.now)
+            self.supervisor.check(self.now)
 
 
 @pytest.fixture
@@ -235,6 +235,6 @@ def test_time_in_which_the_supervisor_stood_counts_against_nobody(watched: Watch
     watched.go_on(1.0)
     for _ in range(5):
         watched.now += 1.9 + LATE_S
-        watched.supervisor.look(watched.now)
+        watched.supervisor.check(watched.now)
     assert watched.said == []
     assert watched.supervisor.servo.process is not None

@@ -233,21 +233,21 @@ def test_a_compilation_that_fails_is_told_once_and_begun_again(monkeypatch: pyte
 
     monkeypatch.setattr(supervisor, "_spawn", spawn)
     compilation = supervisor.Compilation(Path("/runtime"))
-    assert compilation.look(0.0) == ""
+    assert compilation.check(0.0) == ""
     assert began[0][-2:] == ["beside", "/runtime"]
 
     def told(now: float) -> str:
         assert compilation._process is not None
         compilation._process.wait(240.0)
-        return compilation.look(now)
+        return compilation.check(now)
 
     assert told(1.0) == "ended with exit code 3; starting again in 10 s"
-    assert compilation.look(10.9) == ""
+    assert compilation.check(10.9) == ""
     assert len(began) == 1
-    assert compilation.look(11.0) == ""
+    assert compilation.check(11.0) == ""
     assert len(began) == 2
     assert told(12.0) == ""
-    assert compilation.look(1000.0) == ""
+    assert compilation.check(1000.0) == ""
     assert len(began) == 2
     compilation.end()
 

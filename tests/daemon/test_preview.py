@@ -11,9 +11,9 @@ from stereoservo.daemon.preview import (
     EVERY_NS,
     PICTURE_CAPACITY,
     PICTURE_LAYOUT,
-    WANTED_BYTES,
-    WANTED_LAYOUT,
-    WANTED_S,
+    REQUEST_BYTES,
+    REQUEST_LAYOUT,
+    REQUEST_S,
     PreviewEncoder,
     PreviewPicture,
     PreviewRequest,
@@ -28,7 +28,7 @@ from stereoservo.ports.devices import Frame
 def directories(tmp_path: Path) -> CellDirectories:
     found = CellDirectories("cell", tmp_path, tmp_path)
     create_slot(found.preview_slot("left"), PICTURE_CAPACITY, PICTURE_LAYOUT)
-    create_slot(found.preview_request_slot("left"), WANTED_BYTES, WANTED_LAYOUT)
+    create_slot(found.preview_request_slot("left"), REQUEST_BYTES, REQUEST_LAYOUT)
     return found
 
 
@@ -61,7 +61,7 @@ def test_pictures_come_only_while_they_are_wanted(directories: CellDirectories) 
     encoder.offer(frame(3), now + EVERY_NS - 1)  # too soon
     encoder.offer(frame(4), now + EVERY_NS)
     assert picture_of(request).seq == 4
-    encoder.offer(frame(5), time.monotonic_ns() + int(WANTED_S * 1e9) + 1)  # nobody renewed
+    encoder.offer(frame(5), time.monotonic_ns() + int(REQUEST_S * 1e9) + 1)  # nobody renewed
     encoder.close()
     assert request.poll() is None
     request.close()

@@ -10,9 +10,9 @@ import pytest
 from stereoservo.daemon.preview import (
     PICTURE_CAPACITY,
     PICTURE_LAYOUT,
-    WANTED_BYTES,
-    WANTED_LAYOUT,
-    WANTED_S,
+    REQUEST_BYTES,
+    REQUEST_LAYOUT,
+    REQUEST_S,
     PreviewPicture,
 )
 from stereoservo.daemon.seqlock import SlotReader, SlotWriter, create_slot
@@ -53,13 +53,13 @@ def test_pictures_are_asked_for_and_published_only_where_somebody_subscribes(
     directories = CellDirectories("cell", tmp_path, tmp_path)
     for camera in ("left", "right"):
         create_slot(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
-        create_slot(directories.preview_request_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
+        create_slot(directories.preview_request_slot(camera), REQUEST_BYTES, REQUEST_LAYOUT)
     slots = {
         camera: SlotWriter(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
         for camera in ("left", "right")
     }
     wanted = {
-        camera: SlotReader(directories.preview_request_slot(camera), WANTED_LAYOUT) for camera in ("left", "right")
+        camera: SlotReader(directories.preview_request_slot(camera), REQUEST_LAYOUT) for camera in ("left", "right")
     }
     publishers = {"left": Publisher(), "right": Publisher()}
     clock = Clock()
@@ -87,13 +87,13 @@ def test_pictures_are_asked_for_and_published_only_where_somebody_subscribes(
     assert found[1].t_wall == pytest.approx(clock.time() - 0.1, abs=1e-6), "of the shutter"
     request = wanted["left"].poll()
     assert request is not None
-    assert int.from_bytes(request, "little") == clock.ns + int(WANTED_S * 1e9), "until when it holds"
+    assert int.from_bytes(request, "little") == clock.ns + int(REQUEST_S * 1e9), "until when it holds"
     assert publishers["right"].put_ == []
     assert wanted["right"].poll() is None
 
     previews.poll()
     assert len(publishers["left"].put_) == 1, "each once"
-    poll(3, age_s=WANTED_S + 0.1)
+    poll(3, age_s=REQUEST_S + 0.1)
     assert len(publishers["left"].put_) == 1, "what was left from the last time that somebody looked"
     assert wanted["left"].poll() is not None, "it is asked for again while somebody looks"
     poll(4, later_s=0.001)

@@ -17,7 +17,7 @@ import pytest
 from stereoservo.calibration.trial_data import LEAST_POSES
 from stereoservo.core.cycle import Event, Sample, Status
 from stereoservo.core.settings import CoreSettings
-from stereoservo.daemon.jobs.rest_poses import APART, MOST_POSES, RestPoses
+from stereoservo.daemon.jobs.rest_poses import LEAST_DISTANCE, MOST_POSES, RestPoses
 from stereoservo.daemon.kernel_compilation import example_model, example_settings
 from stereoservo.daemon.taught_goals import taught_goal
 from stereoservo.gateway import model_updates, persistence
@@ -109,7 +109,7 @@ def test_a_rest_pose_counts_once_and_only_at_rest() -> None:
     assert {sample.camera for sample in kept.samples} == {camera.name for camera in settings.cameras}
     for sample in kept.samples:  # no frame of the way there is in it
         assert sample.pixels == pytest.approx(100.0 + 10.0 * np.stack([sample.ids] * 2, 1) + 5.0)
-    bench.visit(np.full(n, 0.1 + 0.1 * APART / n))
+    bench.visit(np.full(n, 0.1 + 0.1 * LEAST_DISTANCE / n))
     assert len(poses.poses) == 1
     bench.visit(np.full(n, -0.1))
     assert len(poses.poses) == 2

@@ -103,7 +103,7 @@ def test_the_self_motion_of_seven_joints_is_named(perfect_calibration):
     cell = synthetic.seven()
     seen, points = perfect_calibration(cell, 4)
     pixels = cell.pixels(cell.home[None])[:, 0]
-    with pytest.raises(JointAnglesError, match="do not tell joint") as error:
+    with pytest.raises(JointAnglesError, match="do not determine joint") as error:
         measured_joints(joint_problem(seen, points, pixels, 0.2), limits=limits_of(cell))
     assert error.value.code == "not_observable"
     assert {"j1", "j3", "j5"} <= set(error.value.data["joints"])

@@ -40,7 +40,7 @@ def test_a_process_tells_each_kernel_that_it_compiles(tmp_path: Path, monkeypatc
     listeners = []
     with monkeypatch.context() as patched:
         patched.setattr(compilation.event, "register", lambda kind, listener: listeners.append(listener))
-        kernel_compilation.tell_progress(tmp_path, "first", 7, 380)
+        kernel_compilation.report_progress(tmp_path, "first", 7, 380)
     (listener,) = listeners
     with compilation.event.install_listener("numba:compile", listener):
         dispatcher = KERNELS[__name__, "_twice"]
@@ -99,11 +99,11 @@ def test_a_daemon_is_waited_for_while_it_compiles(tmp_path: Path, monkeypatch: p
 def test_status_and_log_say_how_far_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("stereoservo.daemon.supervisor.TELL_EVERY_S", 0.0)
+    monkeypatch.setattr("stereoservo.daemon.supervisor.REPORT_EVERY_S", 0.0)
     lines = ProgressLines()
     for done in (3, 3, 90):
         _tell(tmp_path, done)
-        lines.look(tmp_path)
+        lines.check(tmp_path)
     told = capfd.readouterr().err.splitlines()
     assert [line.split("(")[-1] for line in told] == [
         "rest: 3 of about 380 kernels)",

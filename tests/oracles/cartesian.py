@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from oracles.face_visibility import Way, way_in_sight
+from oracles.face_visibility import Way, visible_rotation
 from oracles.step_correction import corrected_step
 from stereoservo.control.laws.cartesian3 import APPROACH, LONGEST_STEP, STEP_OF_BOUND
 from stereoservo.geometry.homogeneous import plane_of_points
@@ -170,7 +170,7 @@ def _part(parts: Decomposition, name: str) -> Part:
 
 def _way(face: FloatArray, rotation: Part, displacement: FloatArray, eyes: FloatArray) -> Way:
     angle = rotation.amount if rotation.screw.any() else 0.0
-    return way_in_sight(face, rotation.generator, displacement, eyes, angle)
+    return visible_rotation(face, rotation.generator, displacement, eyes, angle)
 
 
 def _turned(part: Part, angle: float) -> Part:

@@ -23,7 +23,7 @@ class Way(NamedTuple):
     clear: bool
 
 
-def way_in_sight(face: FloatArray, H: FloatArray, displacement: FloatArray, eyes: FloatArray, angle: float) -> Way:
+def visible_rotation(face: FloatArray, H: FloatArray, displacement: FloatArray, eyes: FloatArray, angle: float) -> Way:
     """The way of a face (4,) turned by ``angle`` in [−π, π] with generator ``H`` (4, 4) and moved by (4,).
 
     ``eyes`` (c, 4): camera centres of height 1 times the sign that makes ``faceᵀO`` positive on the visible side.

@@ -255,17 +255,17 @@ def _joint_errors(
 ) -> tuple[JointErrorReport, ...]:
     """Errors of each joint; ``by_joint`` (c, s, m, n) from `joint_variances`."""
     slopes = np.sqrt(np.nanmean(by_joint, axis=(0, 1, 2)) / 2)
-    found, spreads = components.deviations, components.deviations_of_deviations
+    found, sigmas = components.deviations, components.deviations_of_deviations
     return tuple(
         JointErrorReport(
             name,
             kind,
             float(found[j, 0]),
-            float(spreads[j, 0]),
+            float(sigmas[j, 0]),
             float(found[j, 1]),
-            float(spreads[j, 1]),
+            float(sigmas[j, 1]),
             float(found[j, 2]),
-            float(spreads[j, 2]),
+            float(sigmas[j, 2]),
             float(slopes[j] * np.linalg.norm(found[j])),
         )
         for j, (name, kind) in enumerate(zip(trials.joint_names, trials.joint_kinds, strict=True))

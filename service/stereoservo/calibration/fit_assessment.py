@@ -48,17 +48,17 @@ REMEDIES = {
     "points_coplanar": "show the moved camera markers off one plane: a second face, static ones, another pose",
     "not_explained": "did markers slip, did a joint's zero or another camera move as well? Calibrate, or check, again",
     "too_uncertain": "let the moved camera see more: more markers, static ones ([scene] static), another pose",
-    "bad_data": "the data are damaged or not of this cell: look at the text, record again",
-    "bad_file": "the file holds no cameras, or what the wished format cannot hold: look at the text",
+    "bad_data": "the data are damaged or not of this cell: read the text, record again",
+    "bad_file": "the file holds no cameras, or what the wished format cannot hold: read the text",
     "length": "state the distance of two markers that were seen, in metres",
-    "model_does_not_fit": "the model was not refined on-line: `calibrate --check` tells what changed",
-    "step_too_large": "the model was not refined on-line: `calibrate --check` tells what changed; else calibrate again",
+    "model_does_not_fit": "the model was not refined on-line: `calibrate --check` reports what changed",
+    "step_too_large": "the model was not refined on-line: `calibrate --check` reports what changed; else calibrate",
     "not_better": "the model in use stays: nothing is to be done",
     "no_covariance": "calibrate again: a refinement starts from the covariance of a calibration",
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
     "another calibration.base",
-    "too_few_stops": "raise calibration.stops, or give the joint more room: calibration.base, calibration.range",
+    "too_few_stops": "raise calibration.stops, or give the joint more range: calibration.base, calibration.range",
     "joint_did_not_move": "the encoder reported no motion: is the joint's brake released, is its name the right one?",
     "joint_without_effect": "the markers did not move with this joint: do they sit behind it, does its drive turn? If "
     "it does, the motion is too small for the noise: raise calibration.range, or calibration.frames",
@@ -66,14 +66,14 @@ REMEDIES = {
     "views_degenerate": "set the cameras apart (a baseline of a tenth of the distance at least) and show markers that "
     "do not stay in one plane: two faces, or calibration.spread for a flat plate",
     "not_identifiable": "larger motions (calibration.range), markers off one plane (a second face, "
-    "calibration.spread); where there is no room, more stops (calibration.stops) or frames at each "
+    "calibration.spread); where the range is too small, more stops (calibration.stops) or frames at each "
     "(calibration.frames)",
-    "no_convergence": "look at the tracks: did a camera move, are markers mixed up, are joint positions right?",
-    "too_many_outliers": "look at the tracks of the joint named: reflections, mixed-up markers, another joint moving",
+    "no_convergence": "check the tracks: did a camera move, are markers mixed up, are joint positions right?",
+    "too_many_outliers": "check the tracks of the joint named: reflections, mixed-up markers, another joint moving",
     "residual_above_floor": "something is not rigid or not as stated: a loose marker body, play in a joint, a moved "
     "camera, a wrong joint scale, a detector that understates its noise",
-    "noise_understated": "raise the detector's sigma to what the text says; look whether images are dark or blurred",
-    "joints_inexact": "look for play, a loose coupling or a damaged encoder in the joints named; larger motions "
+    "noise_understated": "raise the detector's sigma to the value in the text; are the images dark or blurred?",
+    "joints_inexact": "check for play, a loose coupling or a damaged encoder in the joints named; larger motions "
     "(calibration.range) make such errors smaller beside them",
     "encoder_frozen": "this joint's encoder stood still while the joint moved: its cable, its supply, its driver",
     "lens_implausible": "show markers all over the images, or straight edges (--lines); larger motions, more stops",
@@ -83,19 +83,19 @@ REMEDIES = {
     "moved_together": "something under all the cameras, or the marker body itself, was moved during the trials: fasten "
     "it, calibrate again. Where it happens at the same stop again it is the play of a joint: take another base",
     "camera_moved": "a camera was moved during the trials: fasten it, calibrate again",
-    "camera_or_body_moved": "something moved during the trials, and they do not tell what: look whether cameras, body "
-    "and the arm's base are fast, calibrate again. At the same stop again it is the play of a joint; [scene] static "
-    "markers tell a camera from the rest",
+    "camera_or_body_moved": "something moved during the trials, and they do not determine what: check whether "
+    "cameras, body and the arm's base are fast, calibrate again. At the same stop again it is the play of a joint; "
+    "[scene] static markers distinguish a camera from the rest",
     "marker_slipped": "a marker slipped during the trials: fasten it, calibrate again",
-    "markers_disagree": "run the trials again, with larger motions (calibration.range) or less noise; look whether the "
-    "markers named sit on the same rigid body as the others",
+    "markers_disagree": "run the trials again, with larger motions (calibration.range) or less noise; check whether "
+    "the markers named sit on the same rigid body as the others",
     "markers_collinear": "put markers off their common line: at least one well beside it",
     "markers_exchanged": "the detector of one camera takes two markers for each other: correct its pattern or the ids",
     "views_exchanged": "images of two cameras come under each other's names at times: check their drivers and cables",
-    "views_unrelated": "the cameras do not see the same thing at the same time: check which arm they look at, the "
+    "views_unrelated": "the cameras do not see the same thing at the same time: check which arm they see, the "
     "markers' ids, and that images are not late",
     "no_baseline": "move the cameras apart, by a tenth of their distance to the markers at least",
-    "mixed_mounts": "calibrate cameras that stand and cameras on the tip each on their own",
+    "mixed_mounts": "calibrate static cameras and cameras on the tip each on their own",
     "check_holds": "leave the zeros as they are: there is nothing to reset",
     "other_cause": "remove the cause that the check names, or calibrate again: a reset of zeros would hide it",
     "not_observable": "take a calibration.base where the axes of the joints named are different lines, put the markers "
@@ -122,8 +122,8 @@ class Acceptance(msgspec.Struct, frozen=True):
     advice: tuple[str, ...] = ()
 
 
-def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float | None = None) -> Acceptance:
-    """Assessment of a fitted model. ``depth_spread``: largest relative deviation of a marker's depth, if known."""
+def assess_fit(model: CellModel, report: CalibrationReport, depth_deviation: float | None = None) -> Acceptance:
+    """Assessment of a fitted model. ``depth_deviation``: largest relative deviation of a marker's depth, if known."""
     reasons: list[str] = []
     advice: list[str] = []
     statistics = model.statistics
@@ -138,7 +138,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
             "several at once is untested"
         )
         advice.append("stops of all joints at once (calibration.together) test it; do the markers stay in view there?")
-    _identified(model, report, depth_spread, reasons, advice)
+    _identified(model, report, depth_deviation, reasons, advice)
     grade: Grade = "usable" if reasons else "good"
     summary = f"residual {statistics.rms_px:.3g} px rms" + (
         ", as the measurement noise explains" if statistics.chi2_ok else ""
@@ -155,7 +155,7 @@ def assess_fit(model: CellModel, report: CalibrationReport, depth_spread: float 
 
 def assess_failure(code: str, message: str) -> Acceptance:
     """Assessment of a calibration that gave no model."""
-    remedy = REMEDIES.get(code, "look at the tracks in the report")
+    remedy = REMEDIES.get(code, "check the tracks in the report")
     summary = message if message.endswith((".", "?")) else f"{message}."
     return Acceptance("not usable", f"not usable: {summary} What to do: {remedy}.", (message,), (remedy,))
 
@@ -213,14 +213,14 @@ def _errors_of_readings(report: CalibrationReport, reasons: list[str], advice: l
             f"{report.exact_joints_chance:.1g} of the fits at most); stated deviations contain them"
         )
         advice.append(
-            "more stops (calibration.stops) or frames at each (calibration.frames) tell whether the joints have errors"
+            "more stops (calibration.stops) or frames at each (calibration.frames) show whether the joints have errors"
         )
         return
     giving = [joint.name for joint in report.joints if joint.posture > SEEN * joint.posture_std]
     if giving:
         reasons.append(
             f"joint {', '.join(giving)} is off by an amount that changes with the posture: how much where several "
-            "joints stand apart from the base, the trials show in part only"
+            "joints are away from the base, the trials show in part only"
         )
 
 
@@ -232,7 +232,7 @@ def _left_out(model: CellModel, report: CalibrationReport, reasons: list[str], a
     share = statistics.outliers / max(pixels, 1.0)
     if share > NOTABLE_OUTLIERS:
         reasons.append(f"{share:.0%} of the pixels do not fit and were left out")
-        advice.append("look at the tracks in the report for reflections and mixed-up markers")
+        advice.append("check the tracks in the report for reflections and mixed-up markers")
     if report.markers_left_out:
         markers = ", ".join(str(marker) for marker in report.markers_left_out)
         reasons.append(f"marker {markers} was seen by two cameras too rarely and is not in the model")
@@ -271,14 +271,14 @@ def _identified(
         ratio = 1.0 if depth is None else depth / NOTABLE_DEPTH_DEVIATION
         times = f", {ceil(ratio**2)} times as many in all," if ratio > 1.0 else ""
         advice.append(
-            f"where there is no room, more stops (calibration.stops) or frames at each (calibration.frames){times} do "
-            "the same"
+            f"where the range is too small, more stops (calibration.stops) or frames at each "
+            f"(calibration.frames){times} do the same"
         )
     if not advice and loose:
         advice.append("larger trial motions, markers larger in the image or more stops make it better")
 
 
-def depth_spread(model: CellModel, trials: TrialData) -> float | None:
+def depth_deviation(model: CellModel, trials: TrialData) -> float | None:
     """Largest relative standard deviation of a marker's depth in the left camera; None in the projective stratum.
 
     From the curvature of the fit at the model, over the trials' own stops and sigmas.
@@ -299,8 +299,8 @@ def depth_spread(model: CellModel, trials: TrialData) -> float | None:
     root = column_root(triangle, bounded=True)
     at = charts.start(3)
     depths = rig.points @ rig.cameras[0][2]
-    spreads = []
+    deviations = []
     for i, basis in enumerate(charts.points):
         rows = basis @ rig.cameras[0][2] @ root[at + 3 * i : at + 3 * i + 3]
-        spreads.append(float(np.linalg.norm(rows)) / abs(float(depths[i])))
-    return max(spreads)
+        deviations.append(float(np.linalg.norm(rows)) / abs(float(depths[i])))
+    return max(deviations)

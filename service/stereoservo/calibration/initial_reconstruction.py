@@ -260,7 +260,7 @@ def _degenerate(trials: TrialData, k: int, error: GeometryError) -> CalibrationE
     names = f"{trials.cameras[0].name!r} and {trials.cameras[k].name!r}"
     return CalibrationError(
         "views_degenerate",
-        f"the views of cameras {names} do not determine their geometry: {error}. The cameras must stand "
+        f"the views of cameras {names} do not determine their geometry: {error}. The cameras must be "
         "apart, and the markers must not stay in one plane over all trials",
         cause=error.code,
         cameras=[trials.cameras[0].name, trials.cameras[k].name],

@@ -375,17 +375,17 @@ def _start(trials: TrialData, every: Measurements) -> RigModel:
     moved = displacements(rig, trials.positions)
     origin = _body_origin(trials.generators)
     path = moved[:, :3, :3] @ origin + moved[:, :3, 3]
-    spread = float(np.sqrt(path.var(axis=0).sum()))
-    if not spread > LEAST_MOTION:
+    size = float(np.sqrt(path.var(axis=0).sum()))
+    if not size > LEAST_MOTION:
         raise CalibrationError(
             "joint_did_not_move",
-            f"the body moved by {spread:.2g} m over all {len(moved)} poses; a fit needs centimetres in several "
+            f"the body moved by {size:.2g} m over all {len(moved)} poses; a fit needs centimetres in several "
             "directions",
-            spread_m=spread,
+            spread_m=size,
             joints=n,
         )
-    to_unit = np.eye(4) / spread
-    to_unit[:3, 3], to_unit[3, 3] = -origin / spread, 1.0
+    to_unit = np.eye(4) / size
+    to_unit[:3, 3], to_unit[3, 3] = -origin / size, 1.0
     N = np.array([pixel_normaliser(camera.width, camera.height) for camera in trials.cameras])
     data = _Normalised(
         to_unit @ moved @ np.linalg.inv(to_unit),

@@ -205,12 +205,12 @@ def prior_of_lenses(trials: TrialData, priors: Mapping[str, LensEstimate]) -> Le
     """Priors of the lenses: the given estimates of (k, cu, cv), otherwise the centre near the image's middle; terms
     near zero.
 
-    ``CENTRE_SHARE`` of the width is the centre's standard deviation, ``TERM_SPREADS`` those of the terms.
+    ``CENTRE_SHARE`` of the width is the centre's standard deviation, ``TERM_SIGMAS`` those of the terms.
     """
     straight = undistorted_lenses(trials)
     mean, information = np.zeros((len(straight), 6)), np.zeros((len(straight), 6, 6))
     mean[:, :3] = straight[:, :3]
-    information[:, [3, 4, 5], [3, 4, 5]] = 1.0 / np.array(TERM_SPREADS) ** 2
+    information[:, [3, 4, 5], [3, 4, 5]] = 1.0 / np.array(TERM_SIGMAS) ** 2
     for c, camera in enumerate(trials.cameras):
         if camera.name in priors:
             mean[c, :3] = priors[camera.name].lens[:3]
@@ -271,7 +271,7 @@ WORTH_SHARE = 0.03
 """Least increase of the share of fitting matches by a lens: other misfit is not due to the lens."""
 CENTRE_SHARE = 0.1
 """Prior standard deviation of a lens's centre about the middle of the image [image widths]."""
-TERM_SPREADS = (0.2, 0.01, 0.01)
+TERM_SIGMAS = (0.2, 0.01, 0.01)
 """Prior standard deviations of k2, p1, p2 about zero: several times those of commercial lenses."""
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal variable."""

@@ -296,16 +296,16 @@ def model_jacobian(
         return found
     starts = first_parameters(stated)
     # A static point is treated as a marker at a stop where all joints are at their zero.
-    apart = np.flatnonzero(views.pose < 0)
+    unposed = np.flatnonzero(views.pose < 0)
     index = {marker: i for i, marker in enumerate(model.marker_ids)}
     marker = np.array([index.get(int(i), -1) for i in views.ids], dtype=np.int64)
-    marker[apart] = len(index) + np.arange(len(apart))
+    marker[unposed] = len(index) + np.arange(len(unposed))
     rig = own_acting_rig(model)
     rig = replace(
         rig,
         cameras=matrices,
         lenses=np.array([model.cameras[c].lens for c in group]),
-        points=np.concatenate([rig.points, views.points[apart]]),
+        points=np.concatenate([rig.points, views.points[unposed]]),
     )
     parts = (
         [(starts[0][j], stated.generators[j]) for j in order],
@@ -315,7 +315,7 @@ def model_jacobian(
     )
     generators, cameras, lenses, markers = (tuple(basis for _, basis in part) for part in parts)
     inherited = tuple(basis if motion is None else basis @ motion for basis in cameras)
-    held = tuple(np.zeros_like(markers[0]) for _ in apart)
+    held = tuple(np.zeros_like(markers[0]) for _ in unposed)
     charts = Charts(generators, inherited, lenses, (*markers, *held))
     data = Measurements(
         np.vstack([offsets[:, order], np.zeros(len(order))]),
@@ -330,7 +330,7 @@ def model_jacobian(
     found[:, :, columns] = slope.reshape(k, 2, len(columns))
     rows = entry_jacobian(matrices, rig.lenses, views)
     static = {marker: i for i, marker in enumerate(model.scene_ids)}
-    for r in apart:
+    for r in unposed:
         if int(views.ids[r]) in static:
             by_point = _by_point(rows[r], matrices[views.camera[r]], views.points[r])
             found[r] += by_point @ scene_by_model(model, static[int(views.ids[r])])

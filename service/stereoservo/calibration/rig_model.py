@@ -404,7 +404,7 @@ def common_mount(trials: TrialData) -> Mount:
         raise CalibrationError(
             "mixed_mounts",
             f"the cameras are mounted differently: {listed}. One model needs cameras that see one motion: "
-            "calibrate those that stand and those on the tip each on their own",
+            "calibrate static ones and those on the tip each on their own",
             mounts=mounts,
         )
     return trials.cameras[0].mount

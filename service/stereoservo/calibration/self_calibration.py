@@ -123,7 +123,7 @@ def fit_model(
         return completed(known, trials)
     chain = trials if mount == "eye_to_hand" else reversed_trials(trials)
 
-    def fit(data: TrialData, chosen: FitOptions, joint_errors: JointErrorsTaken = "none") -> _Fitted:
+    def fit(data: TrialData, chosen: FitOptions, joint_errors: JointErrorModel = "none") -> _Fitted:
         return _fit(data, epoch, created, progress or _silent, chosen, priors, None, joint_errors)
 
     def refit(data: TrialData, chosen: FitOptions) -> CalibrationFit:
@@ -198,11 +198,11 @@ class _JointErrorsError(Exception):
     """Errors of the joint readings were assumed to explain the data, but do not."""
 
 
-JointErrorsTaken = Literal["none", "at most likely", "beside scales", "scales too"]
+JointErrorModel = Literal["none", "at most likely", "beside scales", "scales too"]
 """Assumption about joint readings: exact; exact, with a statement of likely errors; with errors, unless scales of the
 joints explain the data better; with errors that may include scales."""
 
-_FitOfTrials = Callable[[TrialData, FitOptions, JointErrorsTaken], _Fitted]
+_FitOfTrials = Callable[[TrialData, FitOptions, JointErrorModel], _Fitted]
 
 
 def _first_fit(
@@ -222,7 +222,7 @@ def _first_fit(
     except _JointErrorsError:
         return exact, None
     except ScalesError as wrong:
-        return _told_by_scales(chain, wrong, exact, lambda data: fit(data, options, "beside scales")), None
+        return _decided_by_scales(chain, wrong, exact, lambda data: fit(data, options, "beside scales")), None
     except (CalibrationError, GeometryError, np.linalg.LinAlgError) as error:
         failure = error
 
@@ -233,7 +233,7 @@ def _first_fit(
     return (exact, tried) if tried.joint_errors else (lambda: tried.fit, None)
 
 
-def _told_by_scales(
+def _decided_by_scales(
     chain: TrialData,
     wrong: ScalesError,
     exact: Callable[[], CalibrationFit],
@@ -343,7 +343,7 @@ def _fit(
     options: FitOptions,
     priors: Mapping[str, LensEstimate],
     bend: float | None = None,
-    joint_errors: JointErrorsTaken = "none",
+    joint_errors: JointErrorModel = "none",
 ) -> _Fitted:
     """Model and report by the stages of this module; ``bend``: initial radial parameter of all lenses;
     ``joint_errors``: permitted errors of the joint readings, if the data show them.
@@ -456,14 +456,14 @@ def _bundles(start: _Start, report_progress: Progress, options: FitOptions) -> _
     raised = select_stratum(solution, _inside(every, solution, inliers), options)
     final, inliers = _settled(raised.solution, every, options)
     for _ in range(2 if options.lens == "auto" else 0):
-        wanted = required_lens_model(final)
-        if wanted == final.lenses and raised.bent and final.lenses != FULL_LENS:
-            wanted = FREE_LENS if final.lenses == "none" else FULL_LENS
-        if wanted == final.lenses:
+        required = required_lens_model(final)
+        if required == final.lenses and raised.bent and final.lenses != FULL_LENS:
+            required = FREE_LENS if final.lenses == "none" else FULL_LENS
+        if required == final.lenses:
             break
         # Only the constraints of the higher stratum separate distortion from kinematics.
         solution, inliers = refine_to_convergence(
-            solution.rig, every.corrected(solution.data.joint_errors), "projective", options, wanted, 1e-6
+            solution.rig, every.corrected(solution.data.joint_errors), "projective", options, required, 1e-6
         )
         raised = select_stratum(solution, _inside(every, solution, inliers), options)
         final, inliers = _settled(raised.solution, every, options)
@@ -553,7 +553,7 @@ def _refined_by_joint_errors(
         refuse_wrong_scales(start.trials, beside)
     components = estimate_components(rows, scales=False, near=beside)
     if near is None and components is not None and final.lenses != "none" and not start.decided:
-        bundles = _bundled_anew(start.with_joint_noise(components.noise(at)), options) or bundles
+        bundles = _rebundled(start.with_joint_noise(components.noise(at)), options) or bundles
         final, inliers = bundles.final, bundles.inliers
     inliers = with_whole_stops(start.every, inliers)
     for _ in range(2):
@@ -575,7 +575,7 @@ def _refined_by_joint_errors(
     return noisy, bundles._replace(final=final, inliers=inliers), components, doubtful
 
 
-def _bundled_anew(noisy: _Start, options: FitOptions) -> _Bundles | None:
+def _rebundled(noisy: _Start, options: FitOptions) -> _Bundles | None:
     """Bundles of a start with joint noise; None if there are none. Errors of readings taken as exact distort lenses."""
     try:
         return _bundles(noisy, _silent, options)

@@ -68,18 +68,18 @@ def linear_generator(
     first, second = distant_pairs(np.abs(angles[:, None] - angles[None, :]) > 0.2 * span)
     valid = finite_rows(points)
     pair, marker = np.nonzero(valid[first] & valid[second])
-    here, there = first[pair], second[pair]
-    step = angles[there] - angles[here]
-    source = points[here, marker]
+    start, end = first[pair], second[pair]
+    step = angles[end] - angles[start]
+    source = points[start, marker]
     blocks, rights = [], []
     for c, P in enumerate(cameras):
-        keep = usable[c, there, marker]
-        target = pixels[c, there, marker][keep]
-        weight = 1.0 / (sigmas[c, there, marker][keep] * (points[there, marker][keep] @ P[2]))
+        keep = usable[c, end, marker]
+        target = pixels[c, end, marker][keep]
+        weight = 1.0 / (sigmas[c, end, marker][keep] * (points[end, marker][keep] @ P[2]))
         rows = (P[None, :2] - target[:, :, None] * P[None, 2:]) * weight[:, None, None]
-        moment = rows[:, :, :, None] * source[keep][:, None, None, :]
+        terms = rows[:, :, :, None] * source[keep][:, None, None, :]
         parts = [np.sin(step[keep]), 2.0 * np.sin(0.5 * step[keep]) ** 2] if kind == "revolute" else [step[keep]]
-        blocks.append(np.concatenate([(part[:, None, None, None] * moment).reshape(-1, 16) for part in parts], axis=1))
+        blocks.append(np.concatenate([(part[:, None, None, None] * terms).reshape(-1, 16) for part in parts], axis=1))
         rights.append(-np.einsum("kij,kj->ki", rows, source[keep]).ravel())
     system, right = np.concatenate(blocks), np.concatenate(rights)
     if not right.size:  # no two distant stops have a marker in common
@@ -232,9 +232,9 @@ FULL, SHORT = 80, 20
 """Evaluations of the cost for a single start, and for each of many."""
 WRONG_SQUARE = 100.0
 """Squared residual, relative to the typical one or to sigmas², at which the cost of a pixel saturates."""
-MISFIT = 20.0
+POOR_FIT = 20.0
 """Median residual [sigmas] of a joint's own trial above which its stated kind is rejected."""
-MISFIT_SHARE = 0.02
+POOR_FIT_SHARE = 0.02
 """Likewise, as a share of the images' motion, if readings may have errors."""
 
 
@@ -345,10 +345,10 @@ def _distal_groups(
     for k in order[left[order]]:
         if not left[k]:
             continue
-        here = np.asarray((np.abs(distal - distal[k]) <= locked[joint + 1 :]).all(axis=1) & still)
-        left &= ~here
-        if int((here & own).sum()) >= 2:
-            groups[here] = count
+        start = np.asarray((np.abs(distal - distal[k]) <= locked[joint + 1 :]).all(axis=1) & still)
+        left &= ~start
+        if int((start & own).sum()) >= 2:
+            groups[start] = count
             if count == 0 and (np.abs(distal[k] - base[joint + 1 :]) > locked[joint + 1 :]).any():
                 base[joint + 1 :] = distal[k]
             count += 1
@@ -396,7 +396,7 @@ def fit_single_joint(
             markers=common,
             minimum=MIN_MARKERS,
         )
-    largest = max(MISFIT, MISFIT_SHARE * _image_motion(trials, stops, joint)[0]) if inexact else MISFIT
+    largest = max(POOR_FIT, POOR_FIT_SHARE * _image_motion(trials, stops, joint)[0]) if inexact else POOR_FIT
     if best is None or not least < largest:
         raise CalibrationError(
             "joint_kind",
@@ -415,8 +415,8 @@ def fit_single_joint(
 def _common_markers(observations: VirtualObservations, angles: FloatArray) -> int:
     """Largest number of virtual markers common to two stops that are half of the trial's range apart."""
     shown = finite_rows(observations.points).astype(np.int64)
-    far_apart = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
-    return int((shown @ shown.T)[far_apart].max(initial=0))
+    distant = np.abs(angles[:, None] - angles[None, :]) > 0.5 * np.ptp(angles)
+    return int((shown @ shown.T)[distant].max(initial=0))
 
 
 @dataclass(frozen=True)
@@ -445,11 +445,11 @@ def virtual_markers(
         np.full((c, k, count * m, 2), np.nan),
         np.ones((c, k, count * m)),
     )
-    here: BoolArray = usable[:, stops] & finite_rows(points[stops])
+    start: BoolArray = usable[:, stops] & finite_rows(points[stops])
     for g in range(count):
         at, rows = slice(g * m, (g + 1) * m), np.flatnonzero(groups == g)
         virtual.points[rows, at] = points[stops[rows]]
-        virtual.usable[:, rows, at] = here[:, rows]
+        virtual.usable[:, rows, at] = start[:, rows]
         virtual.pixels[:, rows, at] = trials.pixels[:, stops[rows]]
         virtual.sigmas[:, rows, at] = trials.sigmas[:, stops[rows]]
     return virtual

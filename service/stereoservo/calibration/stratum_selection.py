@@ -134,7 +134,7 @@ FINISHED, FINISH_EVALUATIONS = 4, 400
 """Most unconverged bundles that are solved to convergence, and the limit of evaluations of each."""
 MOST_TIMES = 5.0
 """Largest ratio of a deviation to the required one at which its first-order value predicts the measurements needed."""
-LOOSE_SPREAD = 0.75
+LOOSE_DEVIATION = 0.75
 """Relative deviation of depths and focal lengths beyond which first-order statistics are meaningless."""
 PLAUSIBLE_TAIL, NESTED_TAIL = 1e-3, 1e-6
 """Probabilities with which a true constraint raises chi-square so much that other starts are tried, and that it is
@@ -170,7 +170,7 @@ class StratumSelector:
             self._note(solution, problem)
             # A good fit with undetermined directions, converged along them or not: any other will have them, too.
             open_ones = solution.statistics.rank < solution.charts.size
-            wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_SPREAD
+            wide = open_ones or max(_relative_deviations(solution).values()) > LOOSE_DEVIATION
             done = solution.converged and not self._worse(solution, PLAUSIBLE_TAIL)
             self.hopeless = self._close(solution) and (wide or done)
             kept = self.loose if self.hopeless or solution.converged else self.unfinished
@@ -237,7 +237,7 @@ class StratumSelector:
             deviation = (
                 max(_relative_deviations(final).values()) if final.statistics.rank == final.charts.size else np.inf
             )
-            if final.converged and deviation <= LOOSE_SPREAD and not self._worse(final, PLAUSIBLE_TAIL, projective):
+            if final.converged and deviation <= LOOSE_DEVIATION and not self._worse(final, PLAUSIBLE_TAIL, projective):
                 self.notes.append(
                     f"the {final.stratum} stratum is taken because the projective bundle leaves directions open; "
                     f"{self._unidentified(final) or 'its spread is small'}"
@@ -316,13 +316,13 @@ def _relative_deviations(solution: Solution) -> dict[str, float]:
     m = len(solution.rig.points)
     scale = np.array([basis[2, 2] for basis in solution.charts.points])
     depths = deviations[-3 * m :].reshape(m, 3)[:, 2] * scale / np.abs(solution.rig.points[:, 2])
-    spreads = {"depths are": float(depths.max())}
+    largest = {"depths are": float(depths.max())}
     if solution.stratum == "metric":
         at = solution.charts.start(1)
         scale = np.array([solution.charts.cameras[0][k, i, i] for k, i in ((0, 0), (3, 1))])
         focal = deviations[[at, at + 3]] * scale / np.abs(np.diag(solution.rig.cameras[0][:2, :2]))
-        spreads["the focal length is"] = float(focal.max())
-    return spreads
+        largest["the focal length is"] = float(focal.max())
+    return largest
 
 
 class StratumSelection(NamedTuple):

@@ -48,7 +48,7 @@ STILL, MOST_OTHERS = 1e-6, 3
 """Motion of other joints [rad or m, rms] that is taken into account, and most directions of it."""
 DELAY_TERMS = 10
 """Most polynomial terms of a joint's tracks, there and back, beside the delay."""
-TAKEN_UP = 0.0, 2e-3, 5e-3, 1e-2, 2e-2
+PLAY_TRAVELS = 0.0, 2e-3, 5e-3, 1e-2, 2e-2
 """Travels of a joint [rad or m] after which its play may be taken up; frames before that are left out of the timing."""
 NO_BETTER = 1.02
 """Ratio of residual variances below which the shorter travel is used."""
@@ -91,11 +91,11 @@ class Leg(msgspec.Struct, frozen=True, eq=False):
         inside = np.clip(times, knots[0], knots[-1])
         first = np.clip(np.searchsorted(knots, inside, side="right") - 2, 0, len(knots) - 4)
         around = first[:, None] + np.arange(4)
-        apart = inside[:, None] - knots[around]
+        differences = inside[:, None] - knots[around]
         found = np.zeros((len(times), self.positions.shape[1]))
         for k in range(4):
             others = [o for o in range(4) if o != k]
-            weight = np.prod(apart[:, others] / (knots[around[:, [k]]] - knots[around[:, others]]), axis=1)
+            weight = np.prod(differences[:, others] / (knots[around[:, [k]]] - knots[around[:, others]]), axis=1)
             found += weight[:, None] * self.positions[around[:, k]]
         return found
 
@@ -128,12 +128,12 @@ def leg_means(leg: Leg, timing: SweepTiming, frames_each: int) -> LegMeans | Non
     """
     shutters = [times + delay for times, delay in zip(leg.times, timing.delays.tolist(), strict=True)]
     shown = [leg.positions_at(times) for times in shutters]
-    middle, end = leg.positions_at(leg.start_s + np.array(LINE) * (leg.end_s - leg.start_s))
-    line = end - middle
+    midpoint, end = leg.positions_at(leg.start_s + np.array(LINE) * (leg.end_s - leg.start_s))
+    line = end - midpoint
     if not line.any():
         return None
-    along = [(q - middle) @ line / (line @ line) for q in shown]
-    straight = [_near_line(q - middle, a, line, leg.resolution) for q, a in zip(shown, along, strict=True)]
+    along = [(q - midpoint) @ line / (line @ line) for q in shown]
+    straight = [_near_line(q - midpoint, a, line, leg.resolution) for q, a in zip(shown, along, strict=True)]
     most = max((a[near] for a, near in zip(along, straight, strict=True)), key=len)
     if len(most) < max(frames_each, FEWEST_FRAMES):
         return None
@@ -325,7 +325,7 @@ def sweep_timing(legs: list[Leg], cameras: int) -> SweepTiming:
     """
     joints = legs[0].positions.shape[1] if legs else 0
     alone = [[leg for leg in legs if leg.trial == joint] for joint in range(joints)]
-    found = [_timing(alone, cameras, travel) for travel in TAKEN_UP]
+    found = [_timing(alone, cameras, travel) for travel in PLAY_TRAVELS]
     least = min(variance for _, _, variance in found)
     values, deviations, _ = next(one for one in found if one[2] <= NO_BETTER * least)
     return SweepTiming(values[:cameras], values[cameras : 2 * cameras], values[2 * cameras :], deviations)
@@ -404,10 +404,10 @@ def _timing_equation(legs: list[Leg], camera: int, values: FloatArray, travel: f
     speed = np.concatenate([_rates(leg, t)[:, joint] for leg, t in zip(legs, times, strict=True)])
     positions, pixels = np.concatenate(readings), np.concatenate([leg.pixels[camera] for leg in legs])
     links, aside = positions[:, joint] - 0.5 * play * ahead, _others(np.delete(positions, joint, axis=1))
-    taken_up = np.abs(positions[:, joint] - starts) >= max(travel, abs(play))
+    past_play = np.abs(positions[:, joint] - starts) >= max(travel, abs(play))
     low, high = float(links.min()), float(links.max())
     square, across, squares, freedom = nothing
-    seen = finite_rows(pixels) & taken_up[:, None]
+    seen = finite_rows(pixels) & past_play[:, None]
     for mask in np.unique(seen, axis=1).T:
         terms = min(DELAY_TERMS, int(mask.sum()) // 3)
         if mask.sum() < FEWEST_FRAMES:
@@ -470,9 +470,9 @@ def _others(positions: FloatArray) -> FloatArray:
 
 def _rates(leg: Leg, times: FloatArray) -> FloatArray:
     """Velocities (f, n) of the joints at ``times`` (f,)."""
-    middles = 0.5 * (leg.joint_times[1:] + leg.joint_times[:-1])
+    midpoints = 0.5 * (leg.joint_times[1:] + leg.joint_times[:-1])
     rates = np.diff(leg.positions, axis=0) / np.maximum(np.diff(leg.joint_times), 1e-9)[:, None]
-    return np.array([np.interp(times, middles, rate) for rate in rates.T]).T
+    return np.array([np.interp(times, midpoints, rate) for rate in rates.T]).T
 
 
 def stamp_scatter(
@@ -488,19 +488,19 @@ def stamp_scatter(
     the joint deviates from its own cubic, at the delay of `DELAYS_S` that explains the frames best. The variances are
     medians: a few frames may deviate for other reasons.
     """
-    middle = np.arange(2, len(times) - 2)
-    around = middle[:, None] + np.array([-2, -1, 1, 2])
-    if not len(middle):
+    midpoint = np.arange(2, len(times) - 2)
+    around = midpoint[:, None] + np.array([-2, -1, 1, 2])
+    if not len(midpoint):
         return 0.0, 0
     powers = np.vander(
-        ((times[around] - times[middle, None]) / (times[middle + 2] - times[middle - 2])[:, None]).ravel(),
+        ((times[around] - times[midpoint, None]) / (times[midpoint + 2] - times[midpoint - 2])[:, None]).ravel(),
         4,
         increasing=True,
     )
-    inverse = np.linalg.inv(powers.reshape(len(middle), 4, 4))
-    value, rate = inverse[:, 0], inverse[:, 1] / (times[middle + 2] - times[middle - 2])[:, None]
-    seen = finite_rows(pixels)[np.column_stack([around, middle])].all(axis=1)[..., None]
-    left = np.where(seen, pixels[middle] - np.einsum("kw,kwmx->kmx", value, pixels[around]), 0.0)
+    inverse = np.linalg.inv(powers.reshape(len(midpoint), 4, 4))
+    value, rate = inverse[:, 0], inverse[:, 1] / (times[midpoint + 2] - times[midpoint - 2])[:, None]
+    seen = finite_rows(pixels)[np.column_stack([around, midpoint])].all(axis=1)[..., None]
+    left = np.where(seen, pixels[midpoint] - np.einsum("kw,kwmx->kmx", value, pixels[around]), 0.0)
     velocity = np.where(seen, np.einsum("kw,kwmx->kmx", rate, pixels[around]), 0.0)
     speed, counts = np.sqrt((velocity**2).sum(axis=(1, 2))), seen.sum(axis=(1, 2))
     readings = np.interp(times + DELAYS_S[:, None], joint_times, positions)
@@ -508,7 +508,7 @@ def stamp_scatter(
     used = (counts >= 2) & (speed > 0.0) & (np.abs(moves).min(axis=0) > LEAST_SHARE * np.abs(moves).max())
     if used.sum() < FEWEST_JUDGED:
         return 0.0, 0
-    deviating = readings[:, middle] - np.einsum("kw,dkw->dk", value, readings[:, around])
+    deviating = readings[:, midpoint] - np.einsum("kw,dkw->dk", value, readings[:, around])
     variance = 1.0 + (value**2).sum(axis=1)
     along = (velocity * left).sum(axis=(1, 2))[used] / speed[used]
     late = deviating[:, used] / moves[:, used]

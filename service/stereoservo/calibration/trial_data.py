@@ -27,7 +27,7 @@ LEAST_POSES = 16
 """Number of rest poses from which a model is refined."""
 LOADS = "loads_"
 STATIC = "static_"
-WAY = "way_"
+PATHS = "way_"
 GENERATORS = "generators"
 MAX_POSITION = 1e6
 """Largest plausible joint position [rad or m]."""
@@ -86,7 +86,7 @@ class StaticObservations(msgspec.Struct, frozen=True, eq=False):
     sigmas: FloatArray
 
 
-class WayObservations(msgspec.Struct, frozen=True, eq=False):
+class PathObservations(msgspec.Struct, frozen=True, eq=False):
     """Frames and joint samples on the paths between stops.
 
     Frames: ``ways`` (f,) number of the path, ``cameras`` (f,) index, ``times`` (f,) [s] as stamped, ``markers`` (f, k)
@@ -127,7 +127,7 @@ class TrialData(msgspec.Struct, frozen=True, eq=False):
     images: int = 0
     loads: JointLoads | None = None
     static: StaticObservations | None = None
-    way: WayObservations | None = None
+    way: PathObservations | None = None
     generators: FloatArray | None = None
 
     @property
@@ -192,7 +192,7 @@ def check_trials(trials: TrialData) -> None:
     if trials.static is not None:
         _check_static(trials, trials.static)
     if trials.way is not None:
-        _check_way(trials, trials.way)
+        _check_paths(trials, trials.way)
     if trials.loads is not None:
         try:
             check_loads(trials.loads, n)
@@ -251,7 +251,7 @@ def _check_static(trials: TrialData, static: StaticObservations) -> None:
     if twice:
         raise CalibrationError(
             "bad_data",
-            f"static ids {twice} stand twice, or are markers of the arm, too",
+            f"static ids {twice} occur twice, or are markers of the arm, too",
             key="static",
             ids=twice,
         )
@@ -267,19 +267,19 @@ def _check_static(trials: TrialData, static: StaticObservations) -> None:
         raise CalibrationError("bad_data", "static sigmas are not all positive numbers", key="static")
 
 
-def _check_way(trials: TrialData, way: WayObservations) -> None:
-    f, k, j = len(way.times), way.markers.shape[-1] if way.markers.ndim == 2 else 0, len(way.joint_times)
+def _check_paths(trials: TrialData, paths: PathObservations) -> None:
+    f, k, j = len(paths.times), paths.markers.shape[-1] if paths.markers.ndim == 2 else 0, len(paths.joint_times)
     shapes: dict[str, tuple[int, ...]] = {
         "ways": (f,), "cameras": (f,), "times": (f,), "markers": (f, k), "pixels": (f, k, 2), "joint_ways": (j,),
         "joint_times": (j,), "positions": (j, len(trials.joint_names)),
     }  # fmt: skip
     for key, shape in shapes.items():
-        array = getattr(way, key)
+        array = getattr(paths, key)
         if array.shape != shape:
             raise CalibrationError("bad_data", f"way_{key} has shape {array.shape}; {shape} is needed", key="way")
         if key != "pixels" and not np.isfinite(array).all():
             raise CalibrationError("bad_data", f"way_{key} holds numbers that are not finite", key="way")
-    if f and not 0 <= int(way.cameras.min()) <= int(way.cameras.max()) < len(trials.cameras):
+    if f and not 0 <= int(paths.cameras.min()) <= int(paths.cameras.max()) < len(trials.cameras):
         raise CalibrationError("bad_data", f"way_cameras: 0 to {len(trials.cameras) - 1} are cameras", key="way")
 
 
@@ -364,7 +364,7 @@ def encode_trials(trials: TrialData) -> bytes:
         **({} if trials.generators is None else {GENERATORS: trials.generators}),  # type: ignore[arg-type]
         **_load_arrays(trials.loads),  # type: ignore[arg-type]
         **_static_arrays(trials.static),  # type: ignore[arg-type]
-        **_way_arrays(trials.way),  # type: ignore[arg-type]
+        **_path_arrays(trials.way),  # type: ignore[arg-type]
     )
     return buffer.getvalue()
 
@@ -387,19 +387,19 @@ def _static_arrays(static: StaticObservations | None) -> dict[str, npt.NDArray[A
     }
 
 
-def _way_arrays(way: WayObservations | None) -> dict[str, npt.NDArray[Any]]:
-    return {} if way is None else {WAY + field: getattr(way, field) for field in WayObservations.__struct_fields__}
+def _path_arrays(paths: PathObservations | None) -> dict[str, npt.NDArray[Any]]:
+    return {} if paths is None else {PATHS + key: getattr(paths, key) for key in PathObservations.__struct_fields__}
 
 
-def _way(arrays: dict[str, npt.NDArray[Any]]) -> WayObservations | None:
-    if WAY + "times" not in arrays:
+def _paths_of(arrays: dict[str, npt.NDArray[Any]]) -> PathObservations | None:
+    if PATHS + "times" not in arrays:
         return None
     whole = ("ways", "cameras", "markers", "joint_ways")
     fields: dict[str, Any] = {
-        field: arrays[WAY + field].astype(np.int64 if field in whole else np.float64, casting="same_kind")
-        for field in WayObservations.__struct_fields__
+        field: arrays[PATHS + field].astype(np.int64 if field in whole else np.float64, casting="same_kind")
+        for field in PathObservations.__struct_fields__
     }
-    return WayObservations(**fields)
+    return PathObservations(**fields)
 
 
 def _static(arrays: dict[str, npt.NDArray[Any]]) -> StaticObservations | None:
@@ -443,7 +443,7 @@ def decode_trials(data: bytes, path: Path | str = "<trials>") -> TrialData:
             images=header.images,
             loads=_loads(arrays),
             static=_static(arrays),
-            way=_way(arrays),
+            way=_paths_of(arrays),
             generators=arrays[GENERATORS].astype(np.float64, casting="same_kind") if GENERATORS in arrays else None,
         )
         try:

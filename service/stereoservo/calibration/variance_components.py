@@ -106,9 +106,9 @@ class VarianceComponents:
         """Standard deviations (n, 3) of `deviations`, to first order; for components estimated as zero, the largest
         likely deviation.
         """
-        spreads = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(3, -1).T
+        sigmas = np.sqrt(np.maximum(np.diag(self.covariance), 0.0)).reshape(3, -1).T
         found = self.deviations
-        return np.where(found**2 > spreads, spreads / (2.0 * np.maximum(found, 1e-300)), np.sqrt(spreads))
+        return np.where(found**2 > sigmas, sigmas / (2.0 * np.maximum(found, 1e-300)), np.sqrt(sigmas))
 
     @property
     def _variance_of_total(self) -> FloatArray:
@@ -143,10 +143,10 @@ class VarianceComponents:
         return joint_noise_of(np.sqrt(self.random), np.sqrt(self.repeatable), np.sqrt(self.posture), at)
 
 
-def _stated(variances: FloatArray, spreads: FloatArray) -> FloatArray:
-    """Standard deviations (n,) of errors whose estimated ``variances`` (n,) have variance ``spreads`` (n,)."""
-    relative_variance = np.minimum(spreads, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
-    return np.sqrt(np.maximum(variances / (1.0 - relative_variance), NONE_SEEN * np.sqrt(spreads)))
+def _stated(variances: FloatArray, uncertainties: FloatArray) -> FloatArray:
+    """Standard deviations (n,) of errors whose estimated ``variances`` (n,) have variance ``uncertainties`` (n,)."""
+    relative_variance = np.minimum(uncertainties, 0.5 * variances**2) / np.where(variances > 0.0, variances**2, 1.0)
+    return np.sqrt(np.maximum(variances / (1.0 - relative_variance), NONE_SEEN * np.sqrt(uncertainties)))
 
 
 def joint_noise_of(random: FloatArray, repeatable: FloatArray, posture: FloatArray, at: Readings) -> JointNoise:
@@ -217,9 +217,9 @@ class ReducedRows(NamedTuple):
         columns, component = [], []
         for joint in range(n):
             of_joint = own * self.slopes[:, joint, None]
-            for kind, spread in enumerate((np.eye(stops), *self.shared(joint))):
-                columns.append(of_joint @ spread)
-                component += [kind * n + joint] * spread.shape[1]
+            for kind, covariance in enumerate((np.eye(stops), *self.shared(joint))):
+                columns.append(of_joint @ covariance)
+                component += [kind * n + joint] * covariance.shape[1]
         return np.hstack(columns), np.array(component, dtype=np.int64)
 
 
@@ -348,12 +348,12 @@ class _Likelihood:
             pulled = reduced.by_stop(reduced.slopes[:, joint] * Py)
             within = reduced.by_stop(reduced.slopes[:, joint, None] * whole)
             mine = slice(1 + joint, None, n)
-            up[mine] = _squares([pulled, *(spread.T @ pulled for spread in shared[joint])])
-            down[mine] = np.trace(within), *((spread * (within @ spread)).sum() for spread in shared[joint])
+            up[mine] = _squares([pulled, *(covariance.T @ pulled for covariance in shared[joint])])
+            down[mine] = np.trace(within), *((covariance * (within @ covariance)).sum() for covariance in shared[joint])
             for other in range(joint, n):
                 inner = reduced.by_stop(reduced.slopes[:, joint, None] * by_own[other])
-                ahead = [inner, *(inner @ spread for spread in shared[other])]
-                rows = [ahead, *([spread.T @ one for one in ahead] for spread in shared[joint])]
+                ahead = [inner, *(inner @ covariance for covariance in shared[other])]
+                rows = [ahead, *([covariance.T @ one for one in ahead] for covariance in shared[joint])]
                 block = np.array([_squares(row) for row in rows])
                 information[mine, 1 + other :: n] = block
                 information[1 + other :: n, mine] = block.T

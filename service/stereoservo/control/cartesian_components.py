@@ -473,10 +473,10 @@ def normal_frame(points: FloatArray, centres: FloatArray) -> tuple[FloatArray, F
             rows[p, i] = points[p % k, i] / math.sqrt(k)
     for p in range(c):
         for i in range(4):
-            middle = 0.0
+            centroid = 0.0
             for h in range(k):
-                middle += points[h, i] / k
-            rows[k + p, i] = (middle + OUT * (centres[p, i] - middle)) / math.sqrt(c)
+                centroid += points[h, i] / k
+            rows[k + p, i] = (centroid + OUT * (centres[p, i] - centroid)) / math.sqrt(c)
     R = np.zeros((4, 4))
     good = True
     for i in range(4):

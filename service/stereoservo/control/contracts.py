@@ -45,17 +45,17 @@ class VirtualCell:
             for s in (1.0, -1.0)
         ]
         inverse = np.linalg.inv(self.frame)
-        middle = np.array([0.0, 0.0, 1.1])
+        centre = np.array([0.0, 0.0, 1.1])
         joints = [twist_matrix(axis, np.zeros(3)) for axis in np.eye(3)]
-        joints += [twist_matrix(-np.cross(axis, middle), axis) for axis in np.eye(3)]
+        joints += [twist_matrix(-np.cross(axis, centre), axis) for axis in np.eye(3)]
         tilt = twist_matrix(np.zeros(3), np.array([0.2, -0.15, 0.3]))
         move = np.eye(4)
-        move[:3, 3] = middle
+        move[:3, 3] = centre
         self.home = PLATE @ (move @ exp_twist(tilt)).T
         self.generators = self.frame @ np.array(joints) @ inverse
         self.matrices = np.ascontiguousarray(np.array(cameras) @ inverse)
-        eyes = np.array([[-s * 0.1, 0.0, 0.0, 1.0] for s in (1.0, -1.0)])
-        self.camera_centres = eyes @ self.frame.T
+        centres = np.array([[-s * 0.1, 0.0, 0.0, 1.0] for s in (1.0, -1.0)])
+        self.camera_centres = centres @ self.frame.T
 
     def points(self, q: FloatArray) -> FloatArray:
         """Markers (4, 4) at joints ``q``, in the frame, of height 1."""
@@ -117,8 +117,8 @@ class LawContract:
     def cell(self, request: pytest.FixtureRequest) -> VirtualCell:
         """A random virtual cell whose goal is at joints zero."""
         rng = np.random.default_rng(request.param)
-        spread = self.start_rad * np.array([1, 1, 1, 3, 3, 3]) / 3.0
-        return VirtualCell(random_frame(rng), spread * rng.uniform(-1.0, 1.0, 6))
+        amplitude = self.start_rad * np.array([1, 1, 1, 3, 3, 3]) / 3.0
+        return VirtualCell(random_frame(rng), amplitude * rng.uniform(-1.0, 1.0, 6))
 
     def run(self, scene: Scene, task: Task, options: Options) -> LawStep:
         """One step of the law."""

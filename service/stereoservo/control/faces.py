@@ -33,7 +33,7 @@ MOST_TRIED = 24
 images.
 """
 LEAST_TRIED = 6
-LOOKS = 32_768
+MAX_EVALUATIONS = 32_768
 """Largest number of triangles times cameras in one choice: for a body with many large faces fewer markers of each are
 tried, but at least `LEAST_TRIED`.
 """
@@ -235,11 +235,11 @@ def seen_whole(starts: IntArray, members: IntArray, seen: FloatArray) -> IntArra
     whole = np.ones(groups, np.int64)
     for g in range(groups):
         for c in range(seen.shape[0]):
-            sights = 0
+            views = 0
             for nth in range(starts[g], starts[g + 1]):
                 if seen[c, members[nth]] > 0.0:
-                    sights += 1
-            if 0 < sights < starts[g + 1] - starts[g]:
+                    views += 1
+            if 0 < views < starts[g + 1] - starts[g]:
                 whole[g] = 0
     return whole
 
@@ -292,11 +292,11 @@ def outward_faces(
         plane = minors(points[i], points[j], points[k])
         votes = 0
         for c in range(seen.shape[0]):
-            sights = 0
+            views = 0
             for nth in range(starts[g], starts[g + 1]):
                 if seen[c, members[nth]] > 0.0:
-                    sights += 1
-            if sights >= 3:
+                    views += 1
+            if views >= 3:
                 votes += 1 if dot(plane, camera_centres[c]) > 0.0 else -1
         if votes == 0:
             votes = (1 if sides[g, 1] > 0 else 0) - (1 if sides[g, 0] > 0 else 0)
@@ -353,9 +353,9 @@ def kept_faces(
     ``points``, ``targets`` (m, 4), ``matrices`` (c, 3, 4), ``camera_centres`` (c, 4): contiguous arrays.
     """
     triples, sided = faces.triples, faces.sided
-    eye = np.eye(4).reshape((1, 4, 4))
-    now = faces_fronting(points, triples, sided, eye, camera_centres)
-    then = faces_fronting(targets, triples, sided, eye, camera_centres)
+    identity = np.eye(4).reshape((1, 4, 4))
+    now = faces_fronting(points, triples, sided, identity, camera_centres)
+    then = faces_fronting(targets, triples, sided, identity, camera_centres)
     lasting = np.zeros(triples.shape[0])
     for f in range(triples.shape[0]):
         for c in range(camera_centres.shape[0]):
@@ -395,7 +395,7 @@ def _kept_rows(rows: FloatArray, kept: FloatArray) -> FloatArray:
 
 
 @kernel
-def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
+def triangle_view(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArray) -> tuple[int, float]:
     """Number of cameras that see a triangle well, and the sum of its areas there, in squared standard deviations of its
     worst marker.
     """
@@ -416,7 +416,7 @@ def triangle_sight(i: int, j: int, k: int, pixels: FloatArray, weights: FloatArr
 
 
 @kernel
-def spread_in_images(
+def spaced_in_images(
     candidates: IntArray, pixels: FloatArray, weights: FloatArray, count: int = MOST_TRIED
 ) -> IntArray:
     """At most ``count`` of the ``candidates`` (k,), ascending, each the farthest in the images from those before it.
@@ -433,12 +433,12 @@ def spread_in_images(
         far = -1
         for a in range(k):
             i, j = candidates[latest], candidates[a]
-            apart = 0.0
+            distance2 = 0.0
             for c in range(weights.shape[0]):
                 if weights[c, i] > 0.0 and weights[c, j] > 0.0:
                     u, v = pixels[c, j, 0] - pixels[c, i, 0], pixels[c, j, 1] - pixels[c, i, 1]
-                    apart += u * u + v * v
-            nearest[a] = apart if nth < 2 else min(nearest[a], apart)
+                    distance2 += u * u + v * v
+            nearest[a] = distance2 if nth < 2 else min(nearest[a], distance2)
             if not chosen[a] and (far < 0 or nearest[a] > nearest[far]):
                 far = a
         if nth < count:
@@ -450,7 +450,7 @@ def spread_in_images(
 @kernel
 def markers_tried(members: FloatArray, usable: FloatArray, cameras: int) -> int:
     """Number of ``usable`` (m,) markers of each face of which all triples are tried: `MOST_TRIED`, or fewer according
-    to `LOOKS`.
+    to `MAX_EVALUATIONS`.
 
     ``members`` (f, m).
     """
@@ -461,11 +461,11 @@ def markers_tried(members: FloatArray, usable: FloatArray, cameras: int) -> int:
                 sizes[f] += 1
     most = MOST_TRIED
     while most > LEAST_TRIED:
-        looks = 0
+        evaluated = 0
         for f in range(sizes.shape[0]):
             k = min(sizes[f], most)
-            looks += cameras * (k * (k - 1) * (k - 2) // 6)
-        if looks <= LOOKS:
+            evaluated += cameras * (k * (k - 1) * (k - 2) // 6)
+        if evaluated <= MAX_EVALUATIONS:
             break
         most -= 1
     return most
@@ -499,12 +499,12 @@ def choose_triangle(
             if usable[i] > 0.0 and (f == faces or members[f, i] > 0.0):
                 candidates[found] = i
                 found += 1
-        tried = spread_in_images(candidates[:found], pixels, weights, most if f < faces else MOST_TRIED)
+        tried = spaced_in_images(candidates[:found], pixels, weights, most if f < faces else MOST_TRIED)
         for a in range(tried.shape[0]):
             for b in range(a + 1, tried.shape[0]):
                 for c in range(b + 1, tried.shape[0]):
                     i, j, k = tried[a], tried[b], tried[c]
-                    count, area = triangle_sight(i, j, k, pixels, weights)
+                    count, area = triangle_view(i, j, k, pixels, weights)
                     if f < faces and lasting[f] > 0.0:
                         area *= LASTING
                     if count > best_count or (count == best_count and area > best_area):
@@ -515,7 +515,7 @@ def choose_triangle(
         for corner in range(3):
             good = good and usable[triple_now[corner]] > 0.0
         if good:
-            count, area = triangle_sight(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
+            count, area = triangle_view(triple_now[0], triple_now[1], triple_now[2], pixels, weights)
             if face_now >= 0 and lasting[face_now] > 0.0:
                 area *= LASTING
             if count > 0 and count >= best_count and best_area <= CLEARLY_BETTER * area:

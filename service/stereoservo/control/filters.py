@@ -83,8 +83,8 @@ def empty_track(cameras: int, markers: int, settings: TrackSettings | None = Non
     )
 
 
-def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: FloatArray) -> TargetTrack:
-    """The track after one more observation: ``pixels`` (c, m, 2) where ``wanted`` (c, m) is not 0 and they are finite.
+def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, required: FloatArray) -> TargetTrack:
+    """The track after one more observation: ``pixels`` (c, m, 2), if finite, where ``required`` (c, m) is not 0.
 
     An observation that is not newer than the newest is ignored. A marker missing in the observation continues at its
     rate until ``gap_s`` after its own last one. If any marker jumps, all markers of the observation restart at rest,
@@ -93,9 +93,9 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
     """
     if not math.isfinite(stamp_s):
         raise ValueError(f"stamp_s is {stamp_s}; a finite time is needed")
-    if pixels.shape != track.positions.shape or wanted.shape != track.tracked.shape:
+    if pixels.shape != track.positions.shape or required.shape != track.tracked.shape:
         raise ValueError(
-            f"pixels {pixels.shape} and wanted {wanted.shape} do not fit; this track takes {track.positions.shape} "
+            f"pixels {pixels.shape} and wanted {required.shape} do not fit; this track takes {track.positions.shape} "
             f"and {track.tracked.shape}"
         )
     if stamp_s <= track.stamp_s:
@@ -107,7 +107,7 @@ def observe(track: TargetTrack, stamp_s: float, pixels: FloatArray, wanted: Floa
         (positions, rates, covariance, stamps, tracked),
         stamp_s,
         np.ascontiguousarray(pixels, dtype=np.float64),
-        np.ascontiguousarray(wanted, dtype=np.float64),
+        np.ascontiguousarray(required, dtype=np.float64),
         (s.sigma_px, s.density_px2_s3, s.rate_px_s, s.jump_sigmas, s.gap_s),
     )
     return TargetTrack(
@@ -125,7 +125,7 @@ def predict(track: TargetTrack, t_s: float) -> tuple[FloatArray, FloatArray, Flo
 
 
 @kernel
-def update_track(track: Fields, stamp_s: float, pixels: FloatArray, wanted: FloatArray, constants: Fields) -> bool:
+def update_track(track: Fields, stamp_s: float, pixels: FloatArray, required: FloatArray, constants: Fields) -> bool:
     """Add one observation to a track's arrays; returns whether a marker jumped. See `observe`.
 
     ``track``: the fields of `TargetTrack` from ``positions`` to ``tracked``; ``constants``: those of `TrackSettings`.
@@ -140,7 +140,7 @@ def update_track(track: Fields, stamp_s: float, pixels: FloatArray, wanted: Floa
             dt = stamp_s - stamps[c, p]
             if tracked[c, p] > 0.0 and dt > gap_s:
                 tracked[c, p] = 0.0
-            if not (tracked[c, p] > 0.0 and _given(pixels, wanted, c, p)):
+            if not (tracked[c, p] > 0.0 and _given(pixels, required, c, p)):
                 continue
             prior = _position_variance(covariance, c, p, dt, density)
             du = pixels[c, p, 0] - positions[c, p, 0] - dt * rates[c, p, 0]
@@ -149,7 +149,7 @@ def update_track(track: Fields, stamp_s: float, pixels: FloatArray, wanted: Floa
                 jumped = True
     for c in range(cameras):
         for p in range(markers):
-            if not _given(pixels, wanted, c, p):
+            if not _given(pixels, required, c, p):
                 continue
             if jumped or not tracked[c, p] > 0.0:
                 for r in range(2):
@@ -178,8 +178,8 @@ def update_track(track: Fields, stamp_s: float, pixels: FloatArray, wanted: Floa
 
 
 @kernel
-def _given(pixels: FloatArray, wanted: FloatArray, c: int, p: int) -> bool:
-    good: bool = wanted[c, p] > 0.0 and math.isfinite(pixels[c, p, 0]) and math.isfinite(pixels[c, p, 1])
+def _given(pixels: FloatArray, required: FloatArray, c: int, p: int) -> bool:
+    good: bool = required[c, p] > 0.0 and math.isfinite(pixels[c, p, 0]) and math.isfinite(pixels[c, p, 1])
     return good
 
 

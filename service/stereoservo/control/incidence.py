@@ -201,16 +201,16 @@ def no_second_task(n: int) -> SecondTask:
 
 
 def joint_task(
-    positions: FloatArray, targets: FloatArray, wanted: FloatArray, scale: FloatArray, gain: float
+    positions: FloatArray, targets: FloatArray, required: FloatArray, scale: FloatArray, gain: float
 ) -> SecondTask:
-    """Joints towards ``targets`` (n,) where ``wanted`` (n,) is 1; ``scale`` (n,) > 0: unit of each joint."""
-    rates = np.where(wanted > 0.0, gain * (targets - positions), 0.0)
-    return SecondTask(np.eye(len(positions)), rates, wanted / scale)
+    """Joints towards ``targets`` (n,) where ``required`` (n,) is 1; ``scale`` (n,) > 0: unit of each joint."""
+    rates = np.where(required > 0.0, gain * (targets - positions), 0.0)
+    return SecondTask(np.eye(len(positions)), rates, required / scale)
 
 
 def limits_task(positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float) -> SecondTask:
-    """Joints away from their limits towards the middle of their ranges, with a velocity that rises with the distance
-    from the middle (`limit_pull`).
+    """Joints away from their limits towards the centre of their ranges, with a velocity that rises with the distance
+    from the centre (`limit_pull`).
     """
     pull, half = limit_pull(positions, lower, upper)
     return SecondTask(np.eye(len(positions)), rate * half * pull, 1.0 / half)
@@ -345,10 +345,10 @@ def incidence_freedoms(
         if not needed or unmade <= tolerance or unmade * step.error_px[0] <= task.tolerance_px:
             found.append(None)
             continue
-        wanted = (body.velocity[len(scene.operators) :, None, None] * rigid).sum(axis=0)
+        required = (body.velocity[len(scene.operators) :, None, None] * rigid).sum(axis=0)
         found.append(
             missing_freedom(
-                scene.operators, scene.matrices, scene.points, plane_at_infinity, wanted,
+                scene.operators, scene.matrices, scene.points, plane_at_infinity, required,
                 H_projective_to_euclidean, camera, tolerance,
             )
         )  # fmt: skip

@@ -290,7 +290,7 @@ def incidence_kernel(
     step = np.zeros(n)
     escaped = False
     if not within and (not share > STATIONARY or (share < MOSTLY and math.sqrt(part) <= tolerance_px)):
-        escaped = _way_out(seen, found.V, metric, total, part, step)
+        escaped = _escape_step(seen, found.V, metric, total, part, step)
         if not escaped:
             _blame(linear.J, linear.e, linear.owner, 2 * matrices.shape[0], status)
     if not escaped and rank > 0:
@@ -331,7 +331,7 @@ def _damped_step(
     V, values, along, total = found.V, found.values, found.along, found.total
     largest = values[0] * values[0]
     damp = damping * largest
-    look = np.empty(n)
+    trial = np.empty(n)
     for _ in range(ATTEMPTS):
         predicted = 0.0
         for i in range(n):
@@ -342,18 +342,18 @@ def _damped_step(
             for i in range(n):
                 s -= V[j, i] * along[i] / (values[i] * values[i] + damp)
             step[j] = s / metric[j]
-            look[j] = ahead * step[j]
+            trial[j] = ahead * step[j]
         # Below it the rounding of the residual itself would decide.
         if predicted <= 1e-12 * total:
             break
-        left = _squared(seen, look)
+        left = _squared(seen, trial)
         if total - left >= SUFFICIENT * predicted:
             break
         damp = max(GROWTH * damp, 1e-3 * largest)
 
 
 @kernel
-def _way_out(
+def _escape_step(
     seen: Seen,
     V: FloatArray,
     metric: FloatArray,
@@ -369,19 +369,19 @@ def _way_out(
     n = step.shape[0]
     size = PROBE * math.sqrt(total / seen.at.shape[0])
     best = (1.0 - WORTH) * total - part
-    look = np.empty(n)
+    trial = np.empty(n)
     found = False
     for back in range(n):
         i = n - 1 - back
         for sense in range(2):
             for j in range(n):
-                look[j] = (size if sense == 0 else -size) * V[j, i] / metric[j]
-            left = _squared(seen, look)
+                trial[j] = (size if sense == 0 else -size) * V[j, i] / metric[j]
+            left = _squared(seen, trial)
             if left < best:
                 best = left
                 found = True
                 for j in range(n):
-                    step[j] = look[j]
+                    step[j] = trial[j]
     return found
 
 

@@ -348,12 +348,12 @@ def marker_distances(points: FloatArray, form: FloatArray) -> FloatArray:
     """Distances (m, m) of markers, heights 1, by a form (4, 4) on their differences."""
     markers = points.shape[0]
     out = np.zeros((markers, markers))
-    way = np.empty(4)
+    edge = np.empty(4)
     for i in range(markers):
         for k in range(markers):
             for x in range(4):
-                way[x] = points[k, x] - points[i, x]
-            out[i, k] = math.sqrt(max(0.0, _form(way, form, way)))
+                edge[x] = points[k, x] - points[i, x]
+            out[i, k] = math.sqrt(max(0.0, _form(edge, form, edge)))
     return out
 
 
@@ -442,7 +442,7 @@ def coplanar_groups(
 
 
 @kernel
-def spread_out(distances: FloatArray, candidates: IntArray, count: int) -> IntArray:
+def spaced(distances: FloatArray, candidates: IntArray, count: int) -> IntArray:
     """At most ``count`` of the ``candidates`` (k,), ascending, each the farthest from those before it.
 
     ``distances`` (m, m); the first is the farthest from the first candidate.
@@ -471,7 +471,7 @@ def _widest(points: FloatArray, form: FloatArray, distances: FloatArray, candida
     """The three of the ``candidates`` (k,), ascending, with the largest altitude; of many, only spread
     ones are tried.
     """
-    few = spread_out(distances, candidates, WIDEST)
+    few = spaced(distances, candidates, WIDEST)
     best = np.zeros(3, np.int64)
     largest = -1.0
     for i in range(few.shape[0]):

@@ -56,25 +56,25 @@ def body_frame(
     for name, value in (("generators", generators), ("cameras", matrices), ("points", points)):
         if not np.isfinite(value).all():
             raise GeometryError("not_finite", f"the {name} are not finite")
-    middle = (points / (points * plane_at_infinity).sum(axis=1)[:, None]).mean(axis=0)
+    centroid = (points / (points * plane_at_infinity).sum(axis=1)[:, None]).mean(axis=0)
     flat = _directions(plane_at_infinity)
     if H_projective_to_euclidean is None:
-        Q = _estimated_metric(generators, matrices, middle, flat)
+        Q = _estimate_metric(generators, matrices, centroid, flat)
     else:
         axes = multiply(H_projective_to_euclidean[:3], flat)
         Q = multiply(axes.T, axes)
     heights = (points * plane_at_infinity).sum(axis=1)[:, None]
-    offsets = multiply(points / heights - middle, flat)
+    offsets = multiply(points / heights - centroid, flat)
     radius = float(np.sqrt((multiply(offsets, Q) * offsets).sum() / len(points)))
     P = matrices[0]
-    m = (P * middle).sum(axis=1)
+    m = (P * centroid).sum(axis=1)
     centre = plane_of_points(P[0], P[1], P[2])
     # Towards the camera, of any height: a centre at infinity is a direction. The depth determines the sign.
-    towards = multiply(flat.T, (centre - float((centre * plane_at_infinity).sum()) * middle)[:, None])[:, 0]
-    size = _length(towards, Q)
+    approach = multiply(flat.T, (centre - float((centre * plane_at_infinity).sum()) * centroid)[:, None])[:, 0]
+    size = _length(approach, Q)
     if not (size > 0.0 and radius > 1e-9 * size):
-        raise GeometryError("degenerate", "the body has no size, or a camera stands in its middle", radius=radius)
-    z = towards / size
+        raise GeometryError("degenerate", "the body has no size, or a camera is at its centre", radius=radius)
+    z = approach / size
     if float((P[2] * (flat * z).sum(axis=1)).sum()) * float(m[2]) > 0.0:
         z = -z
     g = multiply((P[:2] - (m[:2] / m[2])[:, None] * P[2]) / m[2], flat)
@@ -85,7 +85,7 @@ def body_frame(
     y = y / _length(y, Q)
     E = np.empty((4, 4))
     E[:, :3] = radius * multiply(flat, np.column_stack([x, y, z]))
-    E[:, 3] = middle
+    E[:, 3] = centroid
     return E
 
 
@@ -111,7 +111,9 @@ def _directions(plane_at_infinity: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.delete(reflection, k, axis=1))
 
 
-def _estimated_metric(generators: FloatArray, matrices: FloatArray, middle: FloatArray, flat: FloatArray) -> FloatArray:
+def _estimate_metric(
+    generators: FloatArray, matrices: FloatArray, centroid: FloatArray, flat: FloatArray
+) -> FloatArray:
     """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for rotations ``R``."""
     rows = []
     for G in generators:
@@ -121,7 +123,7 @@ def _estimated_metric(generators: FloatArray, matrices: FloatArray, middle: Floa
             R = R / size
             rows.append(np.stack([(multiply(R.T, S) + multiply(S, R)).ravel() for S in _SYMMETRIC], axis=1))
     for P in matrices:
-        m = (P * middle).sum(axis=1)
+        m = (P * centroid).sum(axis=1)
         # Body at the origin, pixels in units of a typical focal length
         centred = np.array([[1, 0, -m[0] / m[2]], [0, 1, -m[1] / m[2]], [0, 0, FOCAL_PX]])
         H = multiply(multiply(centred, P), flat)
@@ -141,7 +143,7 @@ def _estimated_metric(generators: FloatArray, matrices: FloatArray, middle: Floa
     if not values[0] > 1e-9 * values[3]:
         raise GeometryError(
             "degenerate",
-            "right angles cannot be told from this arm and its cameras; give H_projective_to_euclidean",
+            "right angles cannot be determined from this arm and its cameras; give H_projective_to_euclidean",
         )
     estimated: FloatArray = Q / values[3]
     return estimated
@@ -270,25 +272,25 @@ def missing_freedom(
     matrices: FloatArray,
     points: FloatArray,
     plane_at_infinity: FloatArray,
-    wanted: FloatArray,
+    required: FloatArray,
     H_projective_to_euclidean: FloatArray | None = None,
     camera: str = "the first camera",
     tolerance: float = REACH,
 ) -> Freedom | None:
-    """The part of a ``wanted`` motion of the body (4, 4), a generator or twist of any size, that the arm cannot make
+    """The part of a ``required`` motion of the body (4, 4), a generator or twist of any size, that the arm cannot make
     here.
 
     None if at most ``tolerance`` of it remains, or the motion is zero. The ``generator`` is the remaining part. Raises
     GeometryError as `mobility` does, and for a motion that is not finite.
     """
-    if not np.isfinite(wanted).all():
-        raise GeometryError("not_finite", f"the wanted motion is not finite: {np.asarray(wanted).tolist()}")
+    if not np.isfinite(required).all():
+        raise GeometryError("not_finite", f"the required motion is not finite: {np.asarray(required).tolist()}")
     n = operators.shape[0]
     E = body_frame(operators, matrices, points, plane_at_infinity, H_projective_to_euclidean)
     named = rigid_motions(E)
     fields = _motions(E, named, points)
     _refuse_line(fields)
-    field = _motions(E, wanted[None], points)
+    field = _motions(E, required[None], points)
     *_, made = _drivable(E, operators, points, np.ones(n))
     done = multiply(made.T, field)
     left = field - multiply(made, done)
@@ -350,8 +352,8 @@ def rigid_motions(E: FloatArray) -> FloatArray:
 def _twist(E: FloatArray, X: FloatArray) -> FloatArray:
     """Components (6,) of a motion ``X`` (4, 4) along `FREEDOMS`."""
     local = multiply(multiply(invert4(E), X), E)
-    odd = 0.5 * (local[:3, :3] - local[:3, :3].T)
-    return np.array([*local[:3, 3], odd[2, 1], odd[0, 2], odd[1, 0]])
+    skew = 0.5 * (local[:3, :3] - local[:3, :3].T)
+    return np.array([*local[:3, 3], skew[2, 1], skew[0, 2], skew[1, 0]])
 
 
 def _motions(E: FloatArray, generators: FloatArray, points: FloatArray) -> FloatArray:

@@ -220,13 +220,13 @@ def joints_to_block(rows: FloatArray, unit: FloatArray, capacity: int, least: fl
 def self_motion_from_limits(
     rows: FloatArray, positions: FloatArray, lower: FloatArray, upper: FloatArray, rate: float
 ) -> FloatArray:
-    """A joint velocity (n,) that does not move the body and moves joints from their limits towards the middle.
+    """A joint velocity (n,) that does not move the body and moves joints from their limits towards the centre.
 
     ``rows`` (r, n): `point_jacobian`, or an image Jacobian.
     ``positions``, ``lower``, ``upper`` (n,) [rad or m]: infinite for a joint without limits.
     ``rate`` [1/s]: no joint is faster than half its range times ``rate`` (without limits: 1 rad or m times it).
 
-    The pull increases with the cube of the distance from the middle. A motion fades out as it starts to move the body;
+    The pull increases with the cube of the distance from the centre. A motion fades out as it starts to move the body;
     an arm without self-motions rests.
     """
     n = positions.shape[0]

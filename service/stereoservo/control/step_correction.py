@@ -203,9 +203,9 @@ def step_into(
 
 @kernel
 def corrected_step(
-    operators: FloatArray, composition: int, points: FloatArray, wanted: FloatArray, step: FloatArray
+    operators: FloatArray, composition: int, points: FloatArray, required: FloatArray, step: FloatArray
 ) -> FloatArray:
-    """Joint step (n,) that displaces ``points`` (m, 4) to ``wanted`` (m, 4), by Newton's method from ``step`` (n,).
+    """Joint step (n,) that displaces ``points`` (m, 4) to ``required`` (m, 4), by Newton's method from ``step`` (n,).
 
     The Jacobian is recomputed only in iterations after one that did not reduce the change to `STEEP` of the previous
     one. It ends if another iteration would change less than `CONVERGED`: changes decrease at least by the ratio of the
@@ -221,9 +221,9 @@ def corrected_step(
     before, last = math.inf, 0.0
     for j in range(n):
         last = max(last, abs(step[j]))
-    anew = True
+    relinearise = True
     for round_ in range(ITERATIONS):
-        if anew:
+        if relinearise:
             step_into(screws, composition, found, H, turned, work)
         else:
             displacement_into(screws, composition, found, H, work)
@@ -231,14 +231,14 @@ def corrected_step(
         error = 0.0
         for p in range(count):
             for i in range(4):
-                error += (wanted[p, i] - moved[p, i]) ** 2
+                error += (required[p, i] - moved[p, i]) ** 2
         if not error <= SLACK * before:
             break
         before = error
         for j in range(n):
             best[j] = found[j]
             b[j] = 0.0
-        if anew:
+        if relinearise:
             for j in range(n):
                 for k in range(n):
                     N[j, k] = 0.0
@@ -248,12 +248,12 @@ def corrected_step(
                     for i in range(4):
                         rows[p, i, j] = velocity[i]
                 for i in range(4):
-                    add_equation(rows[p, i], wanted[p, i] - moved[p, i], 1.0, N, b)
+                    add_equation(rows[p, i], required[p, i] - moved[p, i], 1.0, N, b)
             damped_solve(N, b, DAMPING, change)
         else:
             for p in range(count):
                 for i in range(4):
-                    residual = wanted[p, i] - moved[p, i]
+                    residual = required[p, i] - moved[p, i]
                     for j in range(n):
                         b[j] += rows[p, i, j] * residual
             factor_solve(N, b, change)
@@ -265,7 +265,7 @@ def corrected_step(
             for j in range(n):
                 best[j] = found[j]
             break
-        anew = not most < STEEP * last
+        relinearise = not most < STEEP * last
         last = most
     return best
 
@@ -361,9 +361,9 @@ def _without(found: FloatArray, count: int, left: FloatArray) -> float:
 
 @kernel
 def damped_step(
-    operators: FloatArray, V: FloatArray, values: FloatArray, wanted: FloatArray, time_s: float
+    operators: FloatArray, V: FloatArray, values: FloatArray, required: FloatArray, time_s: float
 ) -> FloatArray:
-    """Damped joint step (n,) near a singularity, for the part of the motion ``wanted`` (4, 4) that the arm can make.
+    """Damped joint step (n,) near a singularity, for the part of the motion ``required`` (4, 4) that the arm can make.
 
     If most of it is lost, the joints move along the direction that moves the body least (a stretched wrist: its first
     joint against its last), until the arm can make the required motion.
@@ -374,17 +374,17 @@ def damped_step(
     n = operators.shape[0]
     rank = min(n, FREEDOMS)
     step = np.zeros(n)
-    left, image = wanted.copy(), np.empty((4, 4))
+    left, image = required.copy(), np.empty((4, 4))
     whole = 0.0
     for i in range(4):
         for k in range(4):
-            whole += wanted[i, k] ** 2
+            whole += required[i, k] ** 2
     for r in range(rank):
         _image_into(operators, V, r, image)
         along = 0.0
         for i in range(4):
             for k in range(4):
-                along += image[i, k] * wanted[i, k]
+                along += image[i, k] * required[i, k]
         ratio = values[r] / (SINGULAR * values[0])
         damping = LEAST_DAMPING * values[0] * math.sqrt(max(0.0, 1.0 - ratio * ratio))
         amount = along / (values[r] ** 2 + damping**2)

@@ -143,7 +143,7 @@ CAMERAS: dict[str, tuple[type[CameraEstimate] | type[CameraMonitor], tuple[str, 
 """The records of each camera by the name of their field: the type of their numbers, and the arrays in which each camera
 has a row.
 """
-SIGHTS = tuple(name for _, names in CAMERAS.values() for name in names)
+OBSERVATIONS = tuple(name for _, names in CAMERAS.values() for name in names)
 """These arrays are written out with the cameras, not with the block."""
 SETTLED_FRAMES = ("settled_innovation", "settled_variance", "settled_count", "settled_ns")
 """Sums over frames, which are reset with a new model."""
@@ -275,7 +275,7 @@ class Block:
         self._count(counts)
         self.numbers.last_joints_seq = -1
         self.delay_samples[:] = np.nan
-        self.begin_sights(counts["markers"], counts["rows"])
+        self.begin_observations(counts["markers"], counts["rows"])
 
     def __setattr__(self, name: str, value: object) -> None:
         raise AttributeError(f"{name} of the block is a view of its record: write into it")
@@ -304,10 +304,10 @@ class Block:
         """The cell's count for each name in `MOST`."""
         return {name: getattr(self.numbers, name) for name in MOST}
 
-    def begin_sights(self, markers: int, rows: int) -> None:
+    def begin_observations(self, markers: int, rows: int) -> None:
         """Reset the cameras' estimates and frames for so many markers; ``rows`` includes the static points."""
         self._count({**self.counts(), "markers": markers, "rows": rows})
-        for name in SIGHTS:
+        for name in OBSERVATIONS:
             getattr(self, name)[:] = 0
         self.sigma[:] = 1.0
         for camera, frame in zip(self.estimates, self.sightings, strict=True):
@@ -320,11 +320,11 @@ class Block:
         self.delay_past[:] = 0.0
 
     def kept(self) -> dict[str, Any]:
-        """All values to be written out except the `SIGHTS`, by name: numbers, then arrays."""
+        """All values to be written out except the `OBSERVATIONS`, by name: numbers, then arrays."""
         return {
             **{name: getattr(self.numbers, name) for name, *_ in Numbers._fields_ if name != "run"},
             "run": self.numbers.run.kept(),
-            **{name: getattr(self, name) for name in ARRAYS if name not in SIGHTS},
+            **{name: getattr(self, name) for name in ARRAYS if name not in OBSERVATIONS},
         }
 
 

@@ -130,8 +130,8 @@ def camera_read(kind: type, kept: Mapping[str, Any]) -> CameraEstimate | CameraM
         array[:] = kept[name]
     for name, value in kept.items():
         if name == "timing":
-            for number, told in value.items():
-                setattr(found.timing, number, told)
+            for number, stored in value.items():
+                setattr(found.timing, number, stored)
         elif name in type(found).__annotations__ and name not in vars(found):
             setattr(found, name, value)
     return found

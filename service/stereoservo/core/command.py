@@ -22,7 +22,7 @@ from msgspec.structs import force_setattr
 
 from stereoservo.core.context import StepContext
 from stereoservo.core.cycle import NOT_MEASURED
-from stereoservo.core.ingest import TAKEN
+from stereoservo.core.ingest import ACCEPTED
 from stereoservo.core.settings import CoreSettings, MotionLimits
 from stereoservo.core.sources.progress import follow_error
 from stereoservo.messages.reasons import Reason
@@ -31,14 +31,14 @@ from stereoservo.numerics.compilation import kernel
 
 
 @kernel
-def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
+def command(block: Record, workspace: Record, keep_outs: FloatArray) -> None:
     """Stage 6: compute the ``command`` (n,) of the block from the ``velocity`` (n,) of the motion in the workspace
-    ``room``; zero if the drives are not active.
+    ``workspace``; zero if the drives are not active.
 
     Also written to the workspace: ``limited``, whether there is anything to report about the command; ``result``, the
     values that recordings keep, where the error is that of a law's kernel.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n = memory.joints
     sent, velocity, raw = memory.command[:n], work.velocity[:n], work.raw[:n]
     if work.rests != 0:
@@ -50,18 +50,18 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
     feature_age_s = (work.now_ns - newest_ns) * 1e-9
     work.added = 0
     if work.compensates != 0:
-        looks = work.joints_found == TAKEN and (work.needs_features == 0 or feature_age_s <= work.bounds[FRESH])
-        work.added = int(add_friction(block, room, looks))
+        fresh = work.joints_found == ACCEPTED and (work.needs_features == 0 or feature_age_s <= work.bounds[FRESH])
+        work.added = int(add_friction(block, workspace, fresh))
     if work.added == 0:
         raw[:] = velocity
-    _foresee(block, room)
+    _foresee(block, workspace)
     work.previous[:n] = sent
     limits = Bounds(work.limits[: 4 * n].reshape((4, n)), work.bounds, keep_outs)
-    wanted = Wanted(
+    requested = Requested(
         raw, work.outermost[:n], work.previous[:n], work.paused != 0, work.dt_s,
         (work.now_ns - memory.last_joints_ns) * 1e-9, feature_age_s, work.needs_features != 0, work.speed_scale,
     )  # fmt: skip
-    reported, found = limit_velocity(wanted, limits, sent, work.acted[:n])
+    reported, found = limit_velocity(requested, limits, sent, work.acted[:n])
     work.limited, work.finite = int(reported), int(found.finite)
     work.allowed_scale, work.scale, work.share = found.speed_scale, found.scale, found.share
     work.scaled_by, work.shared_by = found.scaled_by, found.shared_by
@@ -75,20 +75,20 @@ def command(block: Record, room: Record, keep_outs: FloatArray) -> None:
 
 
 @kernel
-def _foresee(block: Record, room: Record) -> None:
-    """Write to ``outermost`` (n,) of the workspace ``room`` the extreme position of each joint in its direction of
+def _foresee(block: Record, workspace: Record) -> None:
+    """Write to ``outermost`` (n,) of the ``workspace`` the extreme position of each joint in its direction of
     motion: the current position, or for a late drive the position that the joint reaches before it executes the
     velocity.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     for j in range(memory.joints):
         q, velocity = work.q[j], work.raw[j]
         work.outermost[j] = q
         if memory.delay_s[j] == 0.0:
             continue
         ahead = q + memory.delay_under_way[j]
-        towards = velocity if velocity != 0.0 else memory.command[j]
-        work.outermost[j] = max(q, ahead) if towards > 0.0 else min(q, ahead)
+        direction = velocity if velocity != 0.0 else memory.command[j]
+        work.outermost[j] = max(q, ahead) if direction > 0.0 else min(q, ahead)
 
 
 RISE_S = 0.25
@@ -129,16 +129,16 @@ def friction_bounds(
 
 
 @kernel
-def add_friction(block: Record, room: Record, looks: bool) -> bool:
-    """Write to ``raw`` (n,) of the workspace ``room`` the motion's ``velocity`` (n,) plus the friction compensation;
+def add_friction(block: Record, workspace: Record, fresh: bool) -> bool:
+    """Write to ``raw`` (n,) of the ``workspace`` the motion's ``velocity`` (n,) plus the friction compensation;
     returns whether there is any compensation. Zero remains zero: a joint that shall not move is not compensated.
 
-    If ``looks`` is True, the commanded travel, at the time of its arrival, is compared with the measured travel once it
+    If ``fresh`` is True, the commanded travel, at the time of its arrival, is compared with the measured travel once it
     is large enough. The comparison restarts when the direction reverses.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s, q = memory.joints, work.dt_s, work.q[: memory.joints]
-    wanted, velocity, most, travel = (
+    desired, velocity, most, travel = (
         work.velocity[:n],
         work.raw[:n],
         work.friction_most[:n],
@@ -148,25 +148,25 @@ def add_friction(block: Record, room: Record, looks: bool) -> bool:
     friction, stood_at = memory.friction[:n], memory.friction_from[:n]
     sent, sent_s = memory.friction_sent[:n], memory.friction_s[:n]
     changed = False
-    for j in range(wanted.size):
+    for j in range(desired.size):
         velocity[j] = 0.0
         sent[j] += arrives[j] * dt_s
         sent_s[j] += dt_s
-        if looks:
-            valid = abs(wanted[j]) < SMALL * most[j] and wanted[j] * sent[j] >= 0.0
+        if fresh:
+            valid = abs(desired[j]) < SMALL * most[j] and desired[j] * sent[j] >= 0.0
             enough = valid and abs(sent[j]) > travel[j] + LAG_S * abs(sent[j]) / sent_s[j]
             if enough:
                 share = (q[j] - stood_at[j]) / sent[j]
                 lost = max(0.0, min(1.0 - share, 1.0)) * sent[j] / sent_s[j]
                 friction[j] += min(sent_s[j] / RISE_S, 1.0) * (lost - friction[j])
-            if wanted[j] * friction[j] < 0.0:
+            if desired[j] * friction[j] < 0.0:
                 friction[j] *= 1.0 - min(dt_s / RISE_S, 1.0)
             friction[j] = max(-most[j], min(friction[j], most[j]))
             if enough or not valid:
                 sent[j], sent_s[j], stood_at[j] = 0.0, 0.0, q[j]
         changed = changed or friction[j] != 0.0
-        if wanted[j] != 0.0:
-            velocity[j] = wanted[j] + friction[j]
+        if desired[j] != 0.0:
+            velocity[j] = desired[j] + friction[j]
     return changed
 
 
@@ -309,10 +309,10 @@ def explained(
     finite, speed_scale, scale, scaled_by, share, shared_by = found
     if not finite:
         brake = True
-        _tell_non_finite(inputs.raw, inputs.positions, limits, reasons)
+        _report_non_finite(inputs.raw, inputs.positions, limits, reasons)
     if brake:
         reasons.append(_braking(limited, limits, inputs.brake))
-    _tell_positions(acted.tolist(), inputs, limits, reasons)
+    _report_positions(acted.tolist(), inputs, limits, reasons)
     if scaled_by >= 0 and scale < 1.0 - TOUCHED:
         j = scaled_by
         reasons.append(
@@ -344,8 +344,8 @@ def explained(
 
 def limited_command(context: StepContext, limits: SafetyLimits) -> SafetyResult:
     """The safety stage's result for this step's motion, with its reasons."""
-    room, block = context.derived.room, context.state.block
-    work, given = room.numbers, room.arrays
+    workspace, block = context.derived.workspace, context.state.block
+    work, given = workspace.numbers, workspace.arrays
     raw, command = given["raw"].copy(), block.command.copy()
     if not work.limited:
         return SafetyResult(raw, command)
@@ -414,7 +414,7 @@ def _stale(inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) ->
     return brake
 
 
-def _tell_non_finite(raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]) -> None:
+def _report_non_finite(raw: FloatArray, positions: FloatArray, limits: SafetyLimits, reasons: list[Reason]) -> None:
     for j, name in enumerate(limits.joint_names):
         for what, value in (("command", raw[j]), ("measured position", positions[j])):
             if not math.isfinite(value):
@@ -431,7 +431,7 @@ def _tell_non_finite(raw: FloatArray, positions: FloatArray, limits: SafetyLimit
                 )
 
 
-def _tell_positions(acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> None:
+def _report_positions(acted: list[float], inputs: SafetyInputs, limits: SafetyLimits, reasons: list[Reason]) -> None:
     margin = limits.position_margin
     for j, code in enumerate(int(one) for one in acted):
         if not code:
@@ -533,14 +533,14 @@ def _position_caps(
                 if above:
                     if math.isinf(keep_outs[k, j, 1]):
                         continue
-                    room = behind[j] - (keep_outs[k, j, 1] + margin)
+                    clearance = behind[j] - (keep_outs[k, j, 1] + margin)
                     speed = max(0.0, -previous[j])
                 else:
                     if math.isinf(keep_outs[k, j, 0]):
                         continue
-                    room = keep_outs[k, j, 0] - margin - ahead[j]
+                    clearance = keep_outs[k, j, 0] - margin - ahead[j]
                     speed = max(0.0, previous[j])
-                slack = (room - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
+                slack = (clearance - 0.5 * speed * speed / acceleration_max[j]) / velocity_max[j]
                 if slack > best_slack:
                     best, best_above, best_slack = j, above, slack
         if best < 0:
@@ -575,23 +575,23 @@ def _within_speed_limits(previous: FloatArray, velocity_max: FloatArray) -> Floa
 
 @kernel
 def _velocity_scale(
-    wanted: FloatArray, low: FloatArray, high: FloatArray, velocity_max: FloatArray, speed_scale: float
+    desired: FloatArray, low: FloatArray, high: FloatArray, velocity_max: FloatArray, speed_scale: float
 ) -> tuple[float, int]:
     """The factor that brings all joints within their speed limits, and the joint that requires it, -1 for none.
 
     A joint that brakes for its position limit is held below its speed limit by its cap: it slows no other joint.
     """
     scale, scaled_by = 1.0, -1
-    for j in range(wanted.shape[0]):
+    for j in range(desired.shape[0]):
         limit = velocity_max[j] * speed_scale
-        cap = high[j] if wanted[j] > 0.0 else -low[j]
-        if cap > limit and abs(wanted[j]) * scale > limit:
-            scale = limit / abs(wanted[j])
+        cap = high[j] if desired[j] > 0.0 else -low[j]
+        if cap > limit and abs(desired[j]) * scale > limit:
+            scale = limit / abs(desired[j])
             scaled_by = j
     return scale, scaled_by
 
 
-class Wanted(NamedTuple):
+class Requested(NamedTuple):
     """The requested motion: ``raw`` velocity, joint ``positions`` and the ``previous`` command, (n,) each; the other
     fields as in `SafetyInputs`.
     """
@@ -629,7 +629,7 @@ class LimitsFound(NamedTuple):
 
 
 @kernel
-def limit_velocity(wanted: Wanted, by: Bounds, limited: FloatArray, acted: FloatArray) -> tuple[bool, LimitsFound]:
+def limit_velocity(motion: Requested, by: Bounds, limited: FloatArray, acted: FloatArray) -> tuple[bool, LimitsFound]:
     """Apply staleness, braking, velocity, position, keep-out and acceleration limits, in this order. Returns whether
     there is anything to report, and the `LimitsFound`.
 
@@ -638,7 +638,7 @@ def limit_velocity(wanted: Wanted, by: Bounds, limited: FloatArray, acted: Float
     ``limited`` (n,): receives the velocity.
     ``acted`` (n,): receives the limit that acted on each joint: 0 none, 1 position limit, 2 + k keep-out k.
     """
-    raw, positions, previous, brake, dt, joint_age, feature_age, needs_features, speed_scale = wanted
+    raw, positions, previous, brake, dt, joint_age, feature_age, needs_features, speed_scale = motion
     table, bounds, keep_outs = by
     margin, timeout, fresh, coast = bounds[MARGIN], bounds[TIMEOUT], bounds[FRESH], bounds[COAST]
     limits = JointLimits(table[0], table[1], table[2], table[3], margin, keep_outs)

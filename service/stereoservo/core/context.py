@@ -63,7 +63,7 @@ class Numbers(ctypes.Structure):
     cameras: int
     markers: int
     composition: int
-    eye_count: int
+    viewing_count: int
     measured: int
     error_px: float
     conditioning: float
@@ -101,10 +101,10 @@ class Numbers(ctypes.Structure):
     watches_following: int
     watches_loads: int
     learning: int
-    rounds_apart: int
+    rounds_in_python: int
     quiet: int
     paused: int
-    aims: int
+    has_goal: int
     markers_needed: int
     joints_found: int
     frames_passed: int
@@ -114,7 +114,7 @@ class Numbers(ctypes.Structure):
     contact: int
     following: int
     looked_at: int
-    odd: int
+    inconsistent: int
     any_masked: int
     followed: int
     seen: int
@@ -202,25 +202,25 @@ class Workspace:
     State for this step, written by `core.servo_core.arrange`: the lifecycle, ``active_before`` the driver's last report
     and ``active`` with it; ``modelled``: there is a model; ``frames_as_stops``: Python processes the frames;
     ``erring``: joints may deviate from their readings; the arm is ``stopped``, ``paused``; what is monitored;
-    ``rounds_apart``: Python examines the rounds of frames, and ``quiet``: none of the last ones needed an explanation;
+    ``rounds_in_python``: Python examines the rounds of frames; ``quiet``: none of the last ones needed an explanation;
     ``masked`` (m,); for each camera whether its pose is ``unknown`` and the rule for the offset of its stamps
     (``offset_rule``).
 
     Results of a step: the joints ``q`` (n,), the results of `ingest` for ``joints``, ``frames`` and the ``gap`` of the
     loop; the fields of the ``prediction``, ``weights`` (c, m) and ``pixels`` (c, m, 2); the results of the monitors:
     ``contact``, ``following``, the joint ``worst`` with its travel ``missing``; for a round the cameras that were
-    examined (``looked_at``) and those that are ``odd``, as bit masks. For the frame processed last: joints ``frame_q``
-    (n,), the fields of `residuals`, and until the prediction of the present is written that of its camera alone,
-    ``of_frame``.
+    examined (``looked_at``) and those that are ``inconsistent`` with noise, as bit masks. For the frame processed
+    last: joints ``frame_q`` (n,), the fields of `residuals`, and until the prediction of the present is written that of
+    its camera alone, ``of_frame``.
 
-    Goal that a law works on (``aims``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that count,
+    Goal that a law works on (``has_goal``), as in `state.ServoGoal`: cameras ``used`` (c,), set-points that count,
     ``wanted`` (c, m), the target positions of its markers, its centre, the three markers of its ``face`` and the
-    centres ``eyes`` of the ``eye_count`` cameras that must keep it visible; as in `sources.law.GoalError`, ``usable``,
-    and ``body`` and ``centre`` at present, and whether an ``error_px`` was ``measured``; whether its progress was
-    measured in this step (``followed``), how many of its markers were ``seen``, and the result ``run_found`` of
-    `account_run`. Its ``gain`` at present, and the goal's gains, tolerance and limits, as in `state.LawRun`. Results of
-    a law: see `control.law.Law`. ``scene`` and ``task``: those that laws take; ``aim`` and ``faced``: the goal and face
-    that they belong to.
+    centres ``eyes`` of the ``viewing_count`` cameras that must keep it visible; as in `sources.law.GoalError`,
+    ``usable``, and ``body`` and ``centre`` at present, and whether an ``error_px`` was ``measured``; whether its
+    progress was measured in this step (``followed``), how many of its markers were ``seen``, and the result
+    ``run_found`` of `account_run`. Its ``gain`` at present, and the goal's gains, tolerance and limits, as in
+    `state.LawRun`. Results of a law: see `control.law.Law`. ``scene`` and ``task``: those that laws take; ``loaded``
+    and ``faced``: the goal and the face that they belong to.
 
     Motion: the source's ``velocity`` (n,), the other fields of `core.context.SourceOutput`, and ``raw`` (n,), the
     velocity with friction compensation. Results of `core.command`: ``finite`` to ``shared_by``, ``acted`` (n,),
@@ -307,7 +307,7 @@ class Workspace:
             given["set_points"], given["wanted"], given["no_rates"], given["target_points"], given["target_known"],
             given["centre"], given["centre_target"], given["face"],
         )  # fmt: skip
-        self.aim: tuple[Any, ...] = ()
+        self.loaded: tuple[Any, ...] = ()
         self.faced: FaceChoice | None = None
 
     def put_numbers(self, *numbers: float) -> None:
@@ -380,10 +380,10 @@ class Derived:
     ``frame_timeout_s``: age from which on a frame is rejected.
     ``features_fresh_s``: age up to which the features are fresh enough for a law not to coast.
     ``prior_every``: steps between priors.
-    ``look_every``: steps between two examinations of why a law is slow or stuck.
+    ``check_every``: steps between two examinations of why a law is slow or stuck.
     ``laws``: the installed laws, by name.
     ``cameras``: indices by name.
-    ``room``: the workspace of the kernels, with the constants that they take.
+    ``workspace``: the workspace of the kernels, with the constants that they take.
     ``load_limits``: collision thresholds of efforts and following errors, (n,) each; None: collisions are not
     monitored.
     """
@@ -393,10 +393,10 @@ class Derived:
     frame_timeout_s: float
     features_fresh_s: float
     prior_every: int
-    look_every: int
+    check_every: int
     laws: Mapping[str, Law]
     cameras: Mapping[str, int]
-    room: Workspace
+    workspace: Workspace
     arrays: ModelArrays | None = None
     load_limits: tuple[FloatArray, FloatArray] | None = None
     health: tuple[tuple[Any, ...], Health] | None = None
@@ -409,7 +409,7 @@ class Derived:
     def use(self, arrays: ModelArrays) -> None:
         """Use a model from now on."""
         self.arrays = arrays
-        self.room.use(arrays)
+        self.workspace.use(arrays)
 
 
 class Ingested(msgspec.Struct, frozen=True, eq=False):
@@ -443,7 +443,7 @@ class StepContext:
     `core.servo_core.observe` sets ``arrays`` and ``prediction``, ``weights`` (c, m) [1/px] and ideal ``pixels`` (c, m,
     2) of the markers; these need a model.
     ``goals_read``: ids of the goals whose requests were handled in this step; at most one, to limit the computing time.
-    ``goes_on``: the active goal's law has a kernel, and the goal has neither ended nor too few markers.
+    ``stays_active``: the active goal's law has a kernel, and the goal has neither ended nor too few markers.
     ``output``: the output of a motion source in Python; None if a kernel has moved the arm, or nothing did.
     ``moved_arrays``: the model with the target body at its current pose.
     """
@@ -467,7 +467,7 @@ class StepContext:
         self.weights: FloatArray | None = None
         self.pixels: FloatArray | None = None
         self.output: SourceOutput | None = None
-        self.goes_on = False
+        self.stays_active = False
         if self.goals_read:
             self.goals_read = []
         if self.events:
@@ -482,7 +482,7 @@ class StepContext:
     def q(self) -> FloatArray:
         """The measured joint positions (n,), valid for this step only."""
         if self._q is None:
-            self._q = self.derived.room.q.copy()
+            self._q = self.derived.workspace.q.copy()
         return self._q
 
     @property
@@ -493,7 +493,7 @@ class StepContext:
     @property
     def paused(self) -> bool:
         """Whether the active source has to wait in this step."""
-        return bool(self.derived.room.numbers.paused)
+        return bool(self.derived.workspace.numbers.paused)
 
 
 class Finding(msgspec.Struct, frozen=True):

@@ -30,7 +30,7 @@ class DriverFault(msgspec.Struct, frozen=True):
 
 
 class ModelUpdate(msgspec.Struct, frozen=True, eq=False):
-    """A new model for the core: taken only at rest, with an epoch.
+    """A new model for the core: applied only at rest, with an epoch.
 
     ``reanchored``: cameras of which only the matrices are new, in the same frame as before: a suspended goal continues.
     ``kept``: from an earlier run; frames must confirm it before goals use it.

@@ -17,8 +17,8 @@ from stereoservo.core.block import HISTORY, SETTLED_FRAMES
 from stereoservo.core.camera_state import CameraEstimate
 from stereoservo.core.context import LENS_SIZE, StepContext, Workspace
 from stereoservo.core.cycle import ModelUpdate
-from stereoservo.core.ingest import TAKEN, newest_frames
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, model_arrays, require_fitting
+from stereoservo.core.ingest import ACCEPTED, newest_frames
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, model_arrays, require_fitting
 from stereoservo.core.monitor_state import MOVED, ModelComparison
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import collision_thresholds, stated_thresholds
@@ -38,11 +38,11 @@ from stereoservo.core.prediction import (
     present,
     rows_in_use,
     rows_of,
-    undistort_sights,
+    undistort_observations,
     velocities_at,
 )
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import CoreState, share_sights
+from stereoservo.core.state import CoreState, share_observations
 from stereoservo.core.target import track
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.cell_file import MAX_MARKERS
@@ -56,69 +56,69 @@ AT_REST = 1e-3
 
 
 @kernel
-def estimate(block: Record, room: Record) -> None:
-    """Stage 2: update the cameras' estimates by the accepted frames in the workspace ``room``, except those that Python
-    processes (`take_frames_apart`); then predict the current markers.
+def estimate(block: Record, workspace: Record) -> None:
+    """Stage 2: update the cameras' estimates by the accepted frames in the ``workspace``, except those that Python
+    processes (`take_frames_in_python`); then predict the current markers.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     if work.frames_as_stops == 0:
         for c in range(memory.cameras):
             memory.sightings[c].fresh = False
         for k in range(work.frames):
-            if work.arrived_found[k] == TAKEN:
-                take_frame(block, room, k)
+            if work.arrived_found[k] == ACCEPTED:
+                take_frame(block, workspace, k)
     if memory.history_count > 0:
-        present(block, room)
+        present(block, workspace)
 
 
 @kernel
-def note_frames(block: Record, room: Record) -> None:
+def note_frames(block: Record, workspace: Record) -> None:
     """Stage 2 of a cell without a model: store sequence number and number of markers of each accepted frame."""
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     for c in range(memory.cameras):
         memory.sightings[c].fresh = False
     for k in range(work.frames):
-        if work.arrived_found[k] == TAKEN:
-            note_frame(block, room, k)
+        if work.arrived_found[k] == ACCEPTED:
+            note_frame(block, workspace, k)
 
 
 @kernel
-def note_frame(block: Record, room: Record, k: int) -> None:
-    """Store frame ``k`` in the workspace ``room`` as the newest one of its camera."""
-    work = room[0]
+def note_frame(block: Record, workspace: Record, k: int) -> None:
+    """Store frame ``k`` in the ``workspace`` as the newest one of its camera."""
+    work = workspace[0]
     estimate = block[0].estimates[work.arrived_camera[k]]
     estimate.last_seq, estimate.last_visible = work.arrived_seq[k], work.arrived_count[k]
 
 
-def take_frames_apart(context: StepContext) -> None:
+def take_frames_in_python(context: StepContext) -> None:
     """Process the frames of a cell with cameras that may move or with a target that is followed. Python processes them
     one by one; `estimate` then processes none.
     """
-    state, room = context.state, context.derived.room
+    state, workspace = context.state, context.derived.workspace
     for sighting in state.watching.sightings:
         sighting.fresh = False
-    found = room.arrays["arrived_found"]
+    found = workspace.arrays["arrived_found"]
     for k, observation in enumerate(newest_frames(context.inputs)):
-        if found[k] == TAKEN:
+        if found[k] == ACCEPTED:
             camera = context.derived.cameras[observation.camera]
             if state.target is not None:
                 track.take_frame(camera, observation, context)
-            _take_frame_apart(camera, k, observation.t_shutter_ns, context)
+            _take_frame_in_python(camera, k, observation.t_shutter_ns, context)
     if state.target is not None:
         context.moved_arrays = track.present_arrays(context)
 
 
-def _take_frame_apart(camera: int, k: int, t_ns: int, context: StepContext) -> None:
+def _take_frame_in_python(camera: int, k: int, t_ns: int, context: StepContext) -> None:
     """Process a frame like `take_frame`, and check whether the camera moves."""
-    state, room = context.state, context.derived.room
+    state, workspace = context.state, context.derived.workspace
     if context.derived.arrays is None:
-        note_frame(state.block.record, room.record, k)
+        note_frame(state.block.record, workspace.record, k)
         return
-    found = see_frame(state.block.record, room.record, k)
-    if found & TOLD:  # the arm's position is measured, not only predicted
-        _look_for_motion(camera, t_ns, context)
-    room.arrays["unknown"][camera] = place_unknown(camera, state, context.settings)
-    fold_frame(state.block.record, room.record, k, found)
+    found = see_frame(state.block.record, workspace.record, k)
+    if found & MEASURED:  # the arm's position is measured, not only predicted
+        _detect_camera_motion(camera, t_ns, context)
+    workspace.arrays["unknown"][camera] = pose_unknown(camera, state, context.settings)
+    fold_frame(state.block.record, workspace.record, k, found)
 
 
 # -- the model ----------------------------------------------------------------------------------------------
@@ -143,7 +143,7 @@ def take_model(context: StepContext) -> None:
         if run is None or run.phase != "take":
             return
         use_model(state.pending_model, context, masked=masked_ids(state))
-        camera_relocalization.taken(run, state, context.now_ns)
+        camera_relocalization.on_model_applied(run, state, context.now_ns)
     elif (
         MOTION_SOURCES[type(state.source)].runs_law
         or state.planning is not None
@@ -163,7 +163,7 @@ def take_model(context: StepContext) -> None:
     state.pending_model, state.pending_reanchored = None, ()
     readiness = str(state.readiness)
     context.emit("model", message=f"model epoch {model.epoch} is {readiness}", name=readiness)
-    track.tell_untrackable(context)
+    track.report_untrackable(context)
 
 
 NOT_COMPARED = Reason(
@@ -178,7 +178,7 @@ def _await_model(update: ModelUpdate, context: StepContext) -> None:
     """Store a model until it may be used; a model of a relocalization must be the one that is expected."""
     state = context.state
     if update.reanchored:
-        refusal = camera_relocalization.misfit(state, update)
+        refusal = camera_relocalization.rejection_reason(state, update)
         if refusal:
             context.emit("warning", message=f"re-anchored model refused: {refusal}")
             return
@@ -194,11 +194,11 @@ def use_model(model: CellModel, context: StepContext, masked: tuple[int, ...] = 
     start_model_monitor(state, arrays, settings, masked)
     state.model = model
     loads = context.derived.load_limits = load_limits(settings, model)
-    context.derived.room.limit_loads(loads)
+    context.derived.workspace.limit_loads(loads)
     state.readiness, state.comparison = fitted_readiness(model), None
     offsets = stated_offsets(model)
     state.cameras = [CameraEstimate(len(model.marker_ids), offsets.get(camera.name, 0)) for camera in settings.cameras]
-    share_sights(state)
+    share_observations(state)
     state.block.numbers.round_due = 0
     for name in SETTLED_FRAMES:
         getattr(state.block, name)[:] = 0
@@ -227,14 +227,14 @@ def workspace(settings: CoreSettings, model: CellModel | None) -> Workspace:
 # -- frames -------------------------------------------------------------------------------------------------
 
 
-def _look_for_motion(camera: int, t_ns: int, context: StepContext) -> None:
+def _detect_camera_motion(camera: int, t_ns: int, context: StepContext) -> None:
     """Check whether a mobile camera moves; while it does, its newest frame is not compared with the prediction."""
-    state, room, arrays = context.state, context.derived.room, context.derived.arrays
+    state, workspace, arrays = context.state, context.derived.workspace, context.derived.arrays
     if state.mobile[camera] is None or arrays is None:
         return
-    residuals = room.residuals(t_ns)
+    residuals = workspace.residuals(t_ns)
     residuals.seen[:] = moving_camera.see(
-        state, context.settings, arrays, camera, residuals, room.of_frame, room.frame_q, context.emit
+        state, context.settings, arrays, camera, residuals, workspace.of_frame, workspace.frame_q, context.emit
     ).seen
 
 
@@ -274,18 +274,18 @@ def offset_rules(state: CoreState, settings: CoreSettings) -> list[tuple[int, in
         rule = FOLLOWS_MOTION if verdict.kind == "ok" else LEAVES
         if camera.name not in offsets:
             rule = LEAVES
-        elif doubtful or place_unknown(c, state, settings):
+        elif doubtful or pose_unknown(c, state, settings):
             rule = AS_STATED
         rules.append((rule, offsets.get(camera.name, 0)))
     return rules
 
 
 @kernel
-def _follow_offset(block: Record, room: Record, k: int) -> None:
+def _follow_offset(block: Record, workspace: Record, k: int) -> None:
     """Correct the offset of a camera's stamps by the motion of its markers, within a bound: see `offset_rules`. The
     corrected shutter time is not later than the arrival of frame ``k``.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     camera = work.arrived_camera[k]
     rule, stated = work.offset_rule[camera], work.stated_offset_ns[camera]
     estimate, timing = memory.estimates[camera], memory.sightings[camera].timing
@@ -300,7 +300,7 @@ def _follow_offset(block: Record, room: Record, k: int) -> None:
     timing.product = timing.square = 0.0
 
 
-def place_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
+def pose_unknown(camera: int, state: CoreState, settings: CoreSettings) -> bool:
     """Whether the pose of a camera is unknown: it is being relocalized, or it moves."""
     mobile = state.mobile[camera]
     if mobile is not None and mobile.moving:
@@ -325,29 +325,29 @@ def masked_ids(state: CoreState) -> tuple[int, ...]:
 AGREEING_PX = 1.5
 
 
-KNOWN, TOLD = 1, 2
+KNOWN, MEASURED = 1, 2
 """Bits of the result of `see_frame`: the joints are known at the shutter time; samples on both sides of it exist."""
 
 
 @kernel
-def take_frame(block: Record, room: Record, k: int) -> None:
-    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time, and update the estimate of
+def take_frame(block: Record, workspace: Record, k: int) -> None:
+    """Compare frame ``k`` in the ``workspace`` with the prediction at its shutter time, and update the estimate of
     its camera.
     """
-    fold_frame(block, room, k, see_frame(block, room, k))
+    fold_frame(block, workspace, k, see_frame(block, workspace, k))
 
 
 @kernel
-def see_frame(block: Record, room: Record, k: int) -> int:
-    """Compare frame ``k`` in the workspace ``room`` with the prediction at its shutter time and write the residuals to
-    the workspace. Returns bits: `KNOWN` if the joints are known at that time, `TOLD` if there are samples on both sides
-    of it.
+def see_frame(block: Record, workspace: Record, k: int) -> int:
+    """Compare frame ``k`` in the ``workspace`` with the prediction at its shutter time and write the residuals to
+    the workspace. Returns bits: `KNOWN` if the joints are known at that time, `MEASURED` if there are samples on both
+    sides of it.
 
     For a frame newer than the last joint sample, the current joint velocities are used. Observations that the camera's
     lens cannot produce are ignored.
     """
-    note_frame(block, room, k)
-    memory, work = block[0], room[0]
+    note_frame(block, workspace, k)
+    memory, work = block[0], workspace[0]
     camera, count = work.arrived_camera[k], work.arrived_count[k]
     n, m, rows, lens_size = memory.joints, memory.markers, memory.rows, work.lens_size
     shutter_ns = work.arrived_ns[k] + memory.estimates[camera].offset_ns
@@ -355,15 +355,15 @@ def see_frame(block: Record, room: Record, k: int) -> int:
     known, then = positions_at(stamps, positions, memory.history_count, shutter_ns)
     q = work.frame_q[:n]
     q[:] = then
-    told, speed = velocities_at(stamps, positions, memory.history_count, shutter_ns)
-    if not told:
+    interpolated, speed = velocities_at(stamps, positions, memory.history_count, shutter_ns)
+    if not interpolated:
         speed = memory.velocities[:n]
     predicted, jacobian = (
         work.predicted[: 2 * m].reshape((1, m, 2)),
         work.jacobian[: 2 * m * n].reshape((1, m, 2, n)),
     )
     predict_into(
-        arm_of(room),
+        arm_of(workspace),
         q,
         work.matrices[12 * camera : 12 * camera + 12].reshape((1, 3, 4)),
         Predicted(
@@ -376,44 +376,44 @@ def see_frame(block: Record, room: Record, k: int) -> int:
     row = rows_of(work.arrived_ids[at : at + count], work.row_ids[:rows], work.row_of[:rows])
     lens = work.lenses[LENS_SIZE * camera : LENS_SIZE * camera + lens_size]
     if not (lens.size == 4 and lens[0] == 0.0):
-        pixels, covariances, possible = undistort_sights(lens, pixels, covariances)
+        pixels, covariances, possible = undistort_observations(lens, pixels, covariances)
         for i in range(row.size):
             if not possible[i]:
                 row[i] = -1
     standing = 2 * rows * camera
     _compare(
-        room,
+        workspace,
         Observations(row, pixels, covariances),
         predicted[0],
         work.scene_pixels[standing : standing + 2 * (rows - m)].reshape((rows - m, 2)),
         jacobian[0],
         speed,
     )
-    return (KNOWN if known else 0) | (TOLD if known and told else 0)
+    return (KNOWN if known else 0) | (MEASURED if known and interpolated else 0)
 
 
 @kernel
-def fold_frame(block: Record, room: Record, k: int, found: int) -> None:
-    """Pass the residuals of frame ``k`` in the workspace ``room`` on; ``found`` is the result of `see_frame`. The
+def fold_frame(block: Record, workspace: Record, k: int, found: int) -> None:
+    """Pass the residuals of frame ``k`` in the ``workspace`` on; ``found`` is the result of `see_frame`. The
     monitors receive them if the joints were sampled on both sides of the shutter time. The camera's estimate is updated
     if the camera's pose is known. Nothing happens if the joints are unknown.
     """
-    work = room[0]
+    work = workspace[0]
     if found & KNOWN == 0:
         return
-    if found & TOLD:
-        fold_residuals(block, room, k)
-        _follow_offset(block, room, k)
+    if found & MEASURED:
+        fold_residuals(block, workspace, k)
+        _follow_offset(block, workspace, k)
     if work.unknown[work.arrived_camera[k]] == 0:
-        accept_sights(block, room, k)
+        gate_frame(block, workspace, k)
 
 
 @kernel
-def fold_residuals(block: Record, room: Record, k: int) -> None:
-    """Store the residuals of frame ``k`` in the workspace ``room`` as the newest ones of its camera. A round becomes
+def fold_residuals(block: Record, workspace: Record, k: int) -> None:
+    """Store the residuals of frame ``k`` in the ``workspace`` as the newest ones of its camera. A round becomes
     due if no round has examined the frame before it.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, rows, m = memory.joints, memory.rows, memory.markers
     camera, t_ns = work.arrived_camera[k], work.arrived_ns[k]
     frame = memory.sightings[camera]
@@ -422,16 +422,16 @@ def fold_residuals(block: Record, room: Record, k: int) -> None:
     frame.t_ns, frame.fresh, frame.looked = t_ns, True, False
     at, end = rows * camera, rows * (camera + 1)
     innovation = memory.frame_innovation[2 * at : 2 * end].reshape((rows, 2))
-    spread = memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2))
+    covariance = memory.frame_spread[4 * at : 4 * end].reshape((rows, 2, 2))
     velocity, seen = memory.frame_velocity[2 * at : 2 * end].reshape((rows, 2)), memory.frame_seen[at:end]
     innovation[:] = work.frame_innovation[: 2 * rows].reshape((rows, 2))
-    spread[:] = work.frame_spread[: 4 * rows].reshape((rows, 2, 2))
+    covariance[:] = work.frame_spread[: 4 * rows].reshape((rows, 2, 2))
     velocity[:] = work.frame_velocity[: 2 * rows].reshape((rows, 2))
     memory.frame_q[n * camera : n * (camera + 1)] = work.frame_q[:n]
     for i in range(rows):
         seen[i] = work.frame_seen[i]
     used = rows_in_use(seen, work.masked[:m])
-    chi2, squares, worst, _, count = camera_chi2(innovation, spread, used, MODEL_SIGMA_PX)
+    chi2, squares, worst, _, count = camera_chi2(innovation, covariance, used, MODEL_SIGMA_PX)
     frame.chi2 = chi2 / max(2.0 * count, 1.0)
     frame.rms_px = math.sqrt(squares / max(2.0 * count, 1.0))
     u, v = (0.0, 0.0) if worst < 0 else (innovation[worst, 0], innovation[worst, 1])
@@ -499,23 +499,23 @@ def _timing_sums(frame: Moved, used: FloatArray) -> tuple[int, float, float, flo
 
 
 @kernel
-def accept_sights(block: Record, room: Record, k: int) -> None:
-    """Gate frame ``k``, whose residuals are in the workspace ``room``, and update the estimate of its camera. Masked
+def gate_frame(block: Record, workspace: Record, k: int) -> None:
+    """Gate frame ``k``, whose residuals are in the ``workspace``, and update the estimate of its camera. Masked
     markers are ignored.
 
     The gate is a chi-square test with two degrees of freedom on the deviation from the filtered innovation and its
     common change (see `_common_change`), with the covariances of detector, timing and model. An observation near the
     gate has a smaller weight in the filter, and a larger sigma in triangulation.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, camera = memory.markers, work.arrived_camera[k]
     used = np.empty(m, np.bool_)
     for i in range(m):
         used[i] = work.frame_seen[i] != 0 and work.masked[i] == 0.0
     common = np.zeros((m, 2))
     if work.erring:
-        _common_change(block, room, camera, used, common)
-    accepted, rejected, squares = _fold_in(block, room, k, used, common)
+        _common_change(block, workspace, camera, used, common)
+    accepted, rejected, squares = _fold_in(block, workspace, k, used, common)
     estimate = memory.estimates[camera]
     estimate.last_visible = accepted
     estimate.frames += 1
@@ -532,7 +532,7 @@ COMMON_ROUNDS = 8
 
 
 @kernel
-def _common_change(block: Record, room: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
+def _common_change(block: Record, workspace: Record, camera: int, used: BoolArray, common: FloatArray) -> None:
     """Write the common change of the innovations to ``common`` (m, 2) [px]: the change since the filtered ones that is
     explained by joints passing through their play or a step, within the errors of joint readings that the model states.
     Zeros if nothing changed.
@@ -540,13 +540,13 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
     ``used`` (m,): markers to use. Huber's weights are iterated: a common change moves all markers, an outlier moves
     one.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, n, at = memory.markers, memory.joints, memory.markers * camera
     filtered, seen_ns = (
         memory.innovation[2 * at : 2 * (at + m)].reshape((m, 2)),
         memory.seen_ns[at : at + m],
     )
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * m].reshape((m, 2)),
         work.frame_spread[: 4 * m].reshape((m, 2, 2)),
     )
@@ -558,7 +558,7 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
         if not (used[i] and seen_ns[i] > 0):
             continue
         rows[count] = i
-        variance[count] = MODEL_SIGMA_PX**2 + 0.5 * (spread[i, 0, 0] + spread[i, 1, 1])
+        variance[count] = MODEL_SIGMA_PX**2 + 0.5 * (covariance[i, 0, 0] + covariance[i, 1, 1])
         for a in range(2):
             change[count, a] = left[count, a] = innovation[i, a] - filtered[i, a]
         d2 = (left[count, 0] ** 2 + left[count, 1] ** 2) / variance[count]
@@ -566,11 +566,11 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
         count += 1
     if count < 3 or largest <= HUBER * HUBER:
         return
-    equations, wanted = np.zeros((2 * count + n, n)), np.zeros(2 * count + n)
+    equations, rhs = np.zeros((2 * count + n, n)), np.zeros(2 * count + n)
     weights, step = np.ones(2 * count + n), np.zeros(n)
     for r in range(count):
         for a in range(2):
-            wanted[2 * r + a] = change[r, a]
+            rhs[2 * r + a] = change[r, a]
             for j in range(n):
                 equations[2 * r + a, j] = jacobian[rows[r], a, j] * deviations[j]
     for j in range(n):
@@ -580,7 +580,7 @@ def _common_change(block: Record, room: Record, camera: int, used: BoolArray, co
             distance = math.sqrt((left[r, 0] ** 2 + left[r, 1] ** 2) / variance[r])
             weight = math.sqrt(min(1.0, HUBER / max(distance, 1e-9)) / variance[r])
             weights[2 * r] = weights[2 * r + 1] = weight
-        step[:] = joint_step(equations, wanted, weights, 0.0)
+        step[:] = joint_step(equations, rhs, weights, 0.0)
         for r in range(count):
             for a in range(2):
                 explained = 0.0
@@ -605,28 +605,28 @@ class Observations(NamedTuple):
 
 @kernel
 def _compare(
-    room: Record,
+    workspace: Record,
     observations: Observations,
     predicted: FloatArray,
     standing: FloatArray,
     jacobian: FloatArray,
     speed: FloatArray,
 ) -> None:
-    """Write the fields of `FrameResiduals` to the workspace ``room``: observed minus predicted pixels [px].
+    """Write the fields of `FrameResiduals` to the ``workspace``: observed minus predicted pixels [px].
 
     ``predicted`` (m, 2), ``standing`` (s, 2): predicted pixels of markers and of static points.
     ``jacobian`` (m, 2, n), ``speed`` (n,): give the pixel velocities; a shutter stamp that is off by `TIMING_SIGMA_S`
     adds to the covariance by them.
     """
-    work, markers, n = room[0], jacobian.shape[0], jacobian.shape[2]
+    work, markers, n = workspace[0], jacobian.shape[0], jacobian.shape[2]
     rows, pixels, covariances = observations
     count = markers + standing.shape[0]
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * count].reshape((count, 2)),
         work.frame_spread[: 4 * count].reshape((count, 2, 2)),
     )
     velocity = work.frame_velocity[: 2 * count].reshape((count, 2))
-    innovation[:], spread[:], velocity[:] = 0.0, 0.0, 0.0
+    innovation[:], covariance[:], velocity[:] = 0.0, 0.0, 0.0
     work.frame_seen[:count], work.frame_noise[:count] = 0, 1.0
     for k in range(rows.size):
         i = rows[k]
@@ -642,27 +642,27 @@ def _compare(
             v += jacobian[i, 1, j] * speed[j] if i < markers else 0.0
         velocity[i, 0], velocity[i, 1] = u, v
         t = TIMING_SIGMA_S * TIMING_SIGMA_S
-        spread[i, 0, 0] = covariances[k, 0, 0] + t * u * u
-        spread[i, 0, 1] = covariances[k, 0, 1] + t * u * v
-        spread[i, 1, 0] = spread[i, 0, 1]
-        spread[i, 1, 1] = covariances[k, 1, 1] + t * v * v
+        covariance[i, 0, 0] = covariances[k, 0, 0] + t * u * u
+        covariance[i, 0, 1] = covariances[k, 0, 1] + t * u * v
+        covariance[i, 1, 0] = covariance[i, 0, 1]
+        covariance[i, 1, 1] = covariances[k, 1, 1] + t * v * v
 
 
 @kernel
-def _fold_in(block: Record, room: Record, k: int, used: BoolArray, common: FloatArray) -> tuple[int, int, float]:
+def _fold_in(block: Record, workspace: Record, k: int, used: BoolArray, common: FloatArray) -> tuple[int, int, float]:
     """Update the filtered innovations by those of frame ``k``, each by its weight; rejected ones change nothing.
     Returns the numbers of accepted and rejected innovations, and the sum of squares of the accepted ones [px²].
 
     ``used`` (m,): markers to use.
     ``common`` (m, 2) [px]: the common change of all markers since the filtered innovations, which the gate subtracts.
 
-    The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SIGHT_SIGMA_PX` for markers that
+    The model error in the gate has the standard deviation `MODEL_SIGMA_PX`, or `FIRST_SEEN_SIGMA_PX` for markers that
     were not seen recently.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     m, t_ns = memory.markers, work.arrived_ns[k]
     at, end = m * work.arrived_camera[k], m * (work.arrived_camera[k] + 1)
-    innovation, spread = (
+    innovation, covariance = (
         work.frame_innovation[: 2 * m].reshape((m, 2)),
         work.frame_spread[: 4 * m].reshape((m, 2, 2)),
     )
@@ -679,10 +679,10 @@ def _fold_in(block: Record, room: Record, k: int, used: BoolArray, common: Float
         if known:
             x -= filtered[i, 0]
             y -= filtered[i, 1]
-        model = MODEL_SIGMA_PX if known else FIRST_SIGHT_SIGMA_PX
+        model = MODEL_SIGMA_PX if known else FIRST_SEEN_SIGMA_PX
         off = model * model
         a, b = (x - common[i, 0], y - common[i, 1]) if known else (x, y)
-        d2 = distance2(a, b, spread[i, 0, 0] + off, spread[i, 0, 1], spread[i, 1, 1] + off)
+        d2 = distance2(a, b, covariance[i, 0, 0] + off, covariance[i, 0, 1], covariance[i, 1, 1] + off)
         if not d2 <= work.gate:
             refused += 1
             continue

@@ -25,9 +25,9 @@ from stereoservo.core.goals.execute import (
 )
 from stereoservo.core.goals.marker_body import BodyState, place_now
 from stereoservo.core.goals.plan import (
-    go_on_planning,
     plan_again,
     plan_report,
+    plan_slice,
     prepare,
     set_up,
     trusted_model,
@@ -139,7 +139,7 @@ def _plan_on(job: PlanJob, context: StepContext) -> None:
         if job.planning is None:
             if not set_up(job, context) or job.planning is not None:
                 return
-        elif not go_on_planning(job):
+        elif not plan_slice(job):
             return
         report = _report_of(job, context)
     except RefusalError as refusal:

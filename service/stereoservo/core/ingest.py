@@ -19,7 +19,7 @@ from stereoservo.core.context import MAX_FRAMES, Ingested, StepContext
 from stereoservo.core.cycle import StepInputs
 from stereoservo.core.move import MOTION_SOURCES
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.state import LEAST_APART_NS, Refused
+from stereoservo.core.state import LEAST_SEPARATION_NS, Refused
 from stereoservo.messages.cell_file import MAX_MARKERS
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import Lifecycle
@@ -46,24 +46,24 @@ FRESH_FRAMES = 2.5  # without a frame for so many periods, a law counts as coast
 
 
 STAMP, VALUES = 2, 3
-"""Results for a joint sample or a frame: `STAMP` and `VALUES` are reasons of rejection, `TAKEN` is accepted, `NO_NEWS`
-was received before.
+"""Results for a joint sample or a frame: `STAMP` and `VALUES` are reasons of rejection, `NO_NEWS` was received
+before.
 """
-NO_NEWS, TAKEN = 0, 1
+NO_NEWS, ACCEPTED = 0, 1
 REFUSED = 1
 """Bit of the stages' detections: an impossible input, or a loop that was interrupted."""
 
 
 @kernel
-def ingest(block: Record, room: Record) -> int:
+def ingest(block: Record, workspace: Record) -> int:
     """Accept inputs that are new and stamped within [now - time-out, now], and store the joints. Returns `REFUSED` if
-    any input is rejected; the reasons are written to the workspace ``room``.
+    any input is rejected; the reasons are written to the ``workspace``.
 
     Rejected inputs are not stored. After a gap the drives have stopped by their own time-out and no longer execute the
     last command, so commands start from rest. If the clock went back, all earlier stamps lie in the future and would
     cause the rejection of every new input: they are reset.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     work.followed = 0
     if work.now_ns < memory.last_step_ns:
         _forget_stamps(block)
@@ -71,13 +71,13 @@ def ingest(block: Record, room: Record) -> int:
     work.elapsed_s = (work.now_ns - last_ns) * 1e-9 if last_ns != 0 else work.nominal_s
     within = 0.0 <= work.elapsed_s <= work.longest_gap_s
     work.gap = int(last_ns != 0 and work.active_before != 0 and not within)
-    pass_frames(block, room)
-    work.joints_found = _take_joints(block, room)
+    pass_frames(block, workspace)
+    work.joints_found = _take_joints(block, workspace)
     memory.last_step_ns = work.now_ns
     if work.gap != 0:
         memory.command[: memory.joints] = 0.0
         forget_travel(block)
-    return REFUSED if work.gap != 0 or work.joints_found > TAKEN or work.frames_refused != 0 else 0
+    return REFUSED if work.gap != 0 or work.joints_found > ACCEPTED or work.frames_refused != 0 else 0
 
 
 @kernel
@@ -100,20 +100,20 @@ def _forget_stamps(block: Record) -> None:
 
 
 @kernel
-def _take_joints(block: Record, room: Record) -> int:
-    """Store the joint sample in the workspace ``room`` if it is new and in time; returns `NO_NEWS`, `TAKEN`, `STAMP` or
+def _take_joints(block: Record, workspace: Record) -> int:
+    """Store the joint sample in the ``workspace`` if it is new and in time; returns `NO_NEWS`, `ACCEPTED`, `STAMP` or
     `VALUES`.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     fresh = work.joints_seq != memory.last_joints_seq and work.joints_ns > memory.last_joints_ns
     if work.joints_given == 0 or not fresh:
-        take_sample(block, room, False)
+        take_sample(block, workspace, False)
         return NO_NEWS
     if not 0.0 <= (work.now_ns - work.joints_ns) * 1e-9 <= work.joint_timeout_s:
-        take_sample(block, room, False)
+        take_sample(block, workspace, False)
         return STAMP
-    if take_sample(block, room, work.joints_whole != 0) and work.joints_whole != 0:
-        return TAKEN
+    if take_sample(block, workspace, work.joints_whole != 0) and work.joints_whole != 0:
+        return ACCEPTED
     return VALUES
 
 
@@ -127,7 +127,7 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
     ``t_ns``, ``positions`` (n,): the new entry.
     """
     size = stamps.size
-    if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_APART_NS:
+    if count > 1 and 0 <= stamps[(count - 1) % size] - stamps[(count - 2) % size] < LEAST_SEPARATION_NS:
         count -= 1
     slot = count % size
     stamps[slot] = t_ns
@@ -137,15 +137,15 @@ def remember_joints(stamps: IntArray, kept: FloatArray, count: int, t_ns: int, p
 
 
 @kernel
-def take_sample(block: Record, room: Record, complete: bool) -> bool:
-    """Store the joint sample in the workspace ``room`` as the newest one of the ``block`` if it is plausible, and
+def take_sample(block: Record, workspace: Record, complete: bool) -> bool:
+    """Store the joint sample in the ``workspace`` as the newest one of the ``block`` if it is plausible, and
     filter the velocities since the last one; returns whether it is plausible. Returns True if there is no sample
     (``complete`` is False).
 
     ``q`` (n,) of the workspace is set to the newest positions, zero before the first sample. The history restarts if
     the positions of an arm that is not driven jump: an encoder was set.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, q = memory.joints, work.q
     kept = memory.history_positions[: HISTORY * n].reshape((HISTORY, n))
     sound = True
@@ -298,23 +298,23 @@ def frame_timeout_s(settings: CoreSettings) -> float:
 
 def put_inputs(context: StepContext) -> None:
     """Write the step's inputs into the workspace."""
-    inputs, room = context.inputs, context.derived.room
-    has_sent = inputs.sent is not None and inputs.sent.shape == room.sent.shape and bool(np.isfinite(inputs.sent).all())
+    inputs, workspace, sent = context.inputs, context.derived.workspace, context.inputs.sent
+    has_sent = sent is not None and sent.shape == workspace.sent.shape and bool(np.isfinite(sent).all())
     if has_sent:
-        room.sent[:] = inputs.sent
+        workspace.sent[:] = sent
     frames = newest_frames(inputs) if inputs.observations else ()
     for k, frame in enumerate(frames):
         camera = context.derived.cameras.get(frame.camera, -1)
         stamp = _within_bounds(frame.seq), _within_bounds(frame.t_shutter_ns)
-        room.put_frame(k, camera, stamp, (frame.ids, frame.pixels, frame.covariances))
+        workspace.put_frame(k, camera, stamp, (frame.ids, frame.pixels, frame.covariances))
     sample, now_ns, count = inputs.joints, inputs.now_ns, len(frames)
     if sample is None:
-        room.put_numbers(now_ns, context.dt_s, inputs.stop, count, has_sent, False, 0, 0, False, False, False)
+        workspace.put_numbers(now_ns, context.dt_s, inputs.stop, count, has_sent, False, 0, 0, False, False, False)
         return
-    whole, t_ns, seq = fill_sample(sample, room.sample), sample.t_ns, sample.seq
+    whole, t_ns, seq = fill_sample(sample, workspace.sample), sample.t_ns, sample.seq
     if not -FARTHEST_INTEGER < t_ns < FARTHEST_INTEGER or not -FARTHEST_INTEGER < seq < FARTHEST_INTEGER:
         t_ns, seq = _within_bounds(t_ns), _within_bounds(seq)
-    room.put_numbers(
+    workspace.put_numbers(
         now_ns, context.dt_s, inputs.stop, count, has_sent, True, t_ns, seq, whole, sample.efforts is not None,
         sample.following_errors is not None,
     )  # fmt: skip
@@ -348,14 +348,14 @@ def fill_sample(sample: JointState, values: FloatArray) -> bool:
 
 
 @kernel
-def pass_frames(block: Record, room: Record) -> None:
-    """Decide for each frame in the workspace ``room``: `TAKEN`, `STAMP`, `VALUES`, or `NO_NEWS`.
+def pass_frames(block: Record, workspace: Record) -> None:
+    """Decide for each frame in the ``workspace``: `ACCEPTED`, `STAMP`, `VALUES`, or `NO_NEWS`.
 
     A frame that is too old does not stop the arm: the law coasts as if the frame had been lost, and brakes in time. If
     a camera restarts its sequence numbers, its frames are recognised by their stamps, which are checked; sequence
     numbers alone are not trusted.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     last_seq, accepted_ns = np.empty(memory.cameras, np.int64), np.empty(memory.cameras, np.int64)
     for c in range(memory.cameras):
         last_seq[c], accepted_ns[c] = memory.estimates[c].last_seq, memory.estimates[c].accepted_ns
@@ -364,8 +364,8 @@ def pass_frames(block: Record, room: Record) -> None:
         c, seq, t_ns = work.arrived_camera[k], work.arrived_seq[k], work.arrived_ns[k]
         found = NO_NEWS
         if c >= 0 and seq != last_seq[c] and not (seq < last_seq[c] and t_ns <= accepted_ns[c]):
-            found = _judged(room, k)
-        if found == TAKEN:
+            found = _judged(workspace, k)
+        if found == ACCEPTED:
             last_seq[c], accepted_ns[c] = seq, max(accepted_ns[c], t_ns)
             work.frames_passed += 1
         elif found != NO_NEWS:
@@ -374,21 +374,21 @@ def pass_frames(block: Record, room: Record) -> None:
 
 
 @kernel
-def _judged(room: Record, k: int) -> int:
-    """Result for the new frame ``k`` of the workspace ``room``: `TAKEN`, or the reason of rejection."""
-    work = room[0]
+def _judged(workspace: Record, k: int) -> int:
+    """Result for the new frame ``k`` of the ``workspace``: `ACCEPTED`, or the reason of rejection."""
+    work = workspace[0]
     if not 0.0 <= (work.now_ns - work.arrived_ns[k]) * 1e-9 <= work.frame_timeout_s:
         return STAMP
-    outside, vague = first_wrong(room, k)
-    return VALUES if work.arrived_count[k] < 0 or outside >= 0 or vague >= 0 else TAKEN
+    outside, vague = first_wrong(workspace, k)
+    return VALUES if work.arrived_count[k] < 0 or outside >= 0 or vague >= 0 else ACCEPTED
 
 
 @kernel
-def first_wrong(room: Record, k: int) -> tuple[int, int]:
-    """The first marker of frame ``k`` of the workspace ``room`` that is farther outside the image than the image's own
+def first_wrong(workspace: Record, k: int) -> tuple[int, int]:
+    """The first marker of frame ``k`` of the ``workspace`` that is farther outside the image than the image's own
     size, and the first one whose covariance is invalid; -1 if there is none.
     """
-    work = room[0]
+    work = workspace[0]
     c, count = work.arrived_camera[k], work.arrived_count[k]
     at = MAX_MARKERS * k
     width, height = work.image_sizes[2 * c], work.image_sizes[2 * c + 1]
@@ -412,20 +412,20 @@ def first_wrong(room: Record, k: int) -> tuple[int, int]:
 
 def passed_frames(context: StepContext) -> tuple[tuple[int, CameraObservation], ...]:
     """The accepted frames, each with the index of its camera."""
-    found, cameras = context.derived.room.arrays["arrived_found"], context.derived.cameras
+    found, cameras = context.derived.workspace.arrays["arrived_found"], context.derived.cameras
     frames = newest_frames(context.inputs)
-    return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == TAKEN])
+    return tuple([(cameras[frame.camera], frame) for k, frame in enumerate(frames) if found[k] == ACCEPTED])
 
 
 def account_inputs(context: StepContext) -> Ingested:
     """The results of `ingest` in this step, with reasons. Rejected inputs of each source are counted since its last
     accepted one.
     """
-    state, work = context.state, context.derived.room.numbers
+    state, work = context.state, context.derived.workspace.numbers
     joints, sample = work.joints_found, context.inputs.joints
-    taken = sample if joints == TAKEN else None
+    accepted = sample if joints == ACCEPTED else None
     refused_joints = None
-    if sample is not None and joints > TAKEN:
+    if sample is not None and joints > ACCEPTED:
         refused_joints = _late(sample, context) if joints == STAMP else _wrong(sample, context)
     passed = passed_frames(context) if work.frames_passed else ()
     refused_frames = _refused_frames(context) if work.frames_refused else ()
@@ -433,7 +433,7 @@ def account_inputs(context: StepContext) -> Ingested:
     stops = tuple(reason for reason in (gap, refused_joints) if reason is not None)
     if MOTION_SOURCES[type(state.source)].by_images:
         stops += tuple(reason for _, reason in refused_frames if reason.level == "hold")
-    if taken is not None:
+    if accepted is not None:
         state.refused_joints.reason = None
     if refused_joints is not None:
         _count(state.refused_joints, refused_joints)
@@ -441,7 +441,7 @@ def account_inputs(context: StepContext) -> Ingested:
         state.refused_frames[camera].reason = None
     for camera, reason in refused_frames:
         _count(state.refused_frames[camera], reason)
-    return Ingested(taken, passed, work.elapsed_s, refused_joints, refused_frames, gap, stops)
+    return Ingested(accepted, passed, work.elapsed_s, refused_joints, refused_frames, gap, stops)
 
 
 def _count(refused: Refused, reason: Reason) -> None:
@@ -541,8 +541,8 @@ def _jump(sample: JointState, context: StepContext) -> Reason:
 
 def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
     """The reasons of rejected frames, each with the index of its camera."""
-    room, cameras = context.derived.room, context.derived.cameras
-    found = room.arrays["arrived_found"]
+    workspace, cameras = context.derived.workspace, context.derived.cameras
+    found = workspace.arrays["arrived_found"]
     refused: list[tuple[int, Reason]] = []
     for k, frame in enumerate(newest_frames(context.inputs)):
         if found[k] == STAMP:
@@ -551,11 +551,11 @@ def _refused_frames(context: StepContext) -> tuple[tuple[int, Reason], ...]:
             refused.append((cameras[frame.camera], reason))
         elif found[k] == VALUES:
             camera = cameras[frame.camera]
-            refused.append((camera, _impossible_frame(frame, _wrong_sights(frame, k, context))))
+            refused.append((camera, _impossible_frame(frame, _wrong_observations(frame, k, context))))
     return tuple(refused)
 
 
-def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str:
+def _wrong_observations(frame: CameraObservation, k: int, context: StepContext) -> str:
     """What is impossible in the markers of frame ``k``."""
     count = len(frame.ids)
     if count > MAX_MARKERS:
@@ -563,7 +563,7 @@ def _wrong_sights(frame: CameraObservation, k: int, context: StepContext) -> str
     pixels, covariances = frame.pixels, frame.covariances
     if pixels.shape != (count, 2) or covariances.shape != (count, 2, 2):
         return f"{count} markers have pixels {pixels.shape} and covariances {covariances.shape}"
-    outside, vague = first_wrong(context.derived.room.record, k)
+    outside, vague = first_wrong(context.derived.workspace.record, k)
     if outside >= 0:
         camera = context.settings.cameras[context.derived.cameras[frame.camera]]
         marker, at = frame.ids[outside], pixels[outside].tolist()

@@ -18,7 +18,7 @@ from stereoservo.kinematics.kernels import invert4, multiply4_into, project_poin
 from stereoservo.kinematics.model import CellModel, lens_size
 from stereoservo.numerics.arrays import FloatArray, IntArray
 
-FIRST_SIGHT_SIGMA_PX = 6.0
+FIRST_SEEN_SIGMA_PX = 6.0
 """Standard deviation [px] of a marker whose innovation is not known."""
 
 
@@ -54,7 +54,7 @@ class ModelArrays:
     row_of: IntArray
     groups: MarkerGroups | None
     """Coplanar markers, from which the faces of the body are chosen; None: the model states none."""
-    sights: int
+    observation_count: int
     """Number of markers times number of cameras; the computing time of a step grows with it."""
     joint_accuracy: JointAccuracy | None
     """Errors of joint readings, if the trials have shown some; none larger than `LARGEST_JOINT_ERROR`."""
@@ -74,7 +74,7 @@ class ModelArrays:
         count = len(self.marker_ids)
         constants = {
             "ids": np.array(self.marker_ids, dtype=np.int64),
-            "unseen_px": np.full(count, FIRST_SIGHT_SIGMA_PX),
+            "unseen_px": np.full(count, FIRST_SEEN_SIGMA_PX),
             "no_rates": np.zeros((len(self.matrices), count, 2)),
             "known": np.array([[0.0], [1.0]]) * np.ones(count),
         }
@@ -164,7 +164,7 @@ def model_arrays(model: CellModel, settings: CoreSettings) -> ModelArrays:
         row_ids=row_ids,
         row_of=row_of,
         groups=groups_of(model),
-        sights=len(model.marker_ids) * len(matrices),
+        observation_count=len(model.marker_ids) * len(matrices),
         joint_accuracy=accuracy,
         joint_variances=np.zeros(len(model.zero)) if accuracy is None else accuracy.stated**2 + accuracy.posture**2,
     )
@@ -199,14 +199,14 @@ def _metric_basis(model: CellModel) -> FloatArray | None:
         return None
     inverse = invert4(np.ascontiguousarray(H, dtype=np.float64))
     euclidean = transform_points(np.ascontiguousarray(H), np.ascontiguousarray(model.marker_points))
-    middle = (euclidean[:, :3] / euclidean[:, 3:]).sum(axis=0) / float(len(euclidean))
-    size = float(np.sqrt(((euclidean[:, :3] / euclidean[:, 3:] - middle) ** 2).sum(axis=-1).max()))
+    centroid = (euclidean[:, :3] / euclidean[:, 3:]).sum(axis=0) / float(len(euclidean))
+    size = float(np.sqrt(((euclidean[:, :3] / euclidean[:, 3:] - centroid) ** 2).sum(axis=-1).max()))
     basis = np.zeros((6, 4, 4))
     for k in range(3):
         basis[k, k, 3] = size
         i, j = (k + 1) % 3, (k + 2) % 3
         basis[3 + k, j, i], basis[3 + k, i, j] = 1.0, -1.0
-        basis[3 + k, j, 3], basis[3 + k, i, 3] = -middle[i], middle[j]
+        basis[3 + k, j, 3], basis[3 + k, i, 3] = -centroid[i], centroid[j]
     for k in range(6):  # H⁻¹ T̂ H, by explicit loops
         basis[k] = _product(inverse, _product(basis[k], H))
     return basis

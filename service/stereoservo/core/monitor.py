@@ -30,7 +30,7 @@ from stereoservo.core.context import Finding, StepContext, Workspace
 from stereoservo.core.estimate import fitted_readiness
 from stereoservo.core.goals.accept import answer_all, refuse_waiting
 from stereoservo.core.goals.execute import end_queue, end_source
-from stereoservo.core.ingest import TAKEN, VALUES
+from stereoservo.core.ingest import ACCEPTED, VALUES
 from stereoservo.core.monitor_state import LATE_S, MOVED, STALE_PERIODS, ModelDiagnosis, ModelMonitor
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.collision import learn_loads, worst_contact
@@ -169,20 +169,20 @@ explanation; a camera that contradicts the model.
 
 
 @kernel
-def detect(block: Record, room: Record) -> int:
+def detect(block: Record, workspace: Record) -> int:
     """Stage 3, in every step: update loads, travel and frames; returns the detections as bits."""
-    memory, work = block[0], room[0]
-    halted = work.stopped != 0 or work.stop != 0 or (work.active != 0 and stops_arm(room))
+    memory, work = block[0], workspace[0]
+    halted = work.stopped != 0 or work.stop != 0 or (work.active != 0 and stops_arm(workspace))
     found = 0
-    work.contact = work.contact_watched = work.looked_at = work.odd = work.any_masked = 0
-    if work.joints_found == TAKEN and work.joints_ns > memory.loads_ns:
-        moving, beyond = account_loads(block, room, halted)
+    work.contact = work.contact_watched = work.looked_at = work.inconsistent = work.any_masked = 0
+    if work.joints_found == ACCEPTED and work.joints_ns > memory.loads_ns:
+        moving, beyond = account_loads(block, workspace, halted)
         work.contact_watched, work.contact = int(moving), int(beyond)
         if (beyond and work.watches_loads != 0) or (moving and work.learning != 0):
             found |= CONTACT
     work.following = FOLLOWS
     if work.watches_following != 0 and memory.history_count > 0:
-        work.following = account_following(block, room)
+        work.following = account_following(block, workspace)
         if work.active == 0:
             memory.silence_known = 0  # what was sent before does not apply to later commands
             work.following = FOLLOWS  # an arm whose drives are off may be moved by hand
@@ -190,10 +190,10 @@ def detect(block: Record, room: Record) -> int:
         return found | NOT_FOLLOWING
     if work.modelled == 0:
         return found
-    if work.rounds_apart == 0 and memory.history_count > 0 and work.faulty == 0 and round_is_due(block):
-        looked_at, odd, masked = judge_round(block, room, 0)
-        work.looked_at, work.odd, work.any_masked = looked_at, odd, int(masked)
-        if looked_at != 0 and (odd != 0 or masked or work.quiet == 0):
+    if work.rounds_in_python == 0 and memory.history_count > 0 and work.faulty == 0 and round_is_due(block):
+        looked_at, inconsistent, masked = judge_round(block, workspace, 0)
+        work.looked_at, work.inconsistent, work.any_masked = looked_at, inconsistent, int(masked)
+        if looked_at != 0 and (inconsistent != 0 or masked or work.quiet == 0):
             found |= ROUND
     for c in range(memory.cameras):
         if memory.estimates[c].rejected_frames >= SUSPECT_FRAMES:
@@ -202,15 +202,15 @@ def detect(block: Record, room: Record) -> int:
 
 
 @kernel
-def stops_arm(room: Record) -> bool:
+def stops_arm(workspace: Record) -> bool:
     """Whether inputs rejected by `ingest` stop an arm that may move."""
-    work = room[0]
-    if work.gap != 0 or work.joints_found > TAKEN:
+    work = workspace[0]
+    if work.gap != 0 or work.joints_found > ACCEPTED:
         return True
     stops = False
     for k in range(work.frames):
         wrong = work.arrived_found[k] == VALUES or work.arrived_ns[k] > work.now_ns
-        stops = stops or (work.by_images != 0 and work.arrived_found[k] > TAKEN and wrong)
+        stops = stops or (work.by_images != 0 and work.arrived_found[k] > ACCEPTED and wrong)
     return stops
 
 
@@ -224,18 +224,18 @@ def round_is_due(block: Record) -> bool:
     return True
 
 
-def explain_contact(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
+def explain_contact(state: CoreState, settings: CoreSettings, workspace: Workspace) -> Reason | None:
     """The reason for the joint in collision (the worst one), from the result of `account_loads` in this step; None if
     there is no collision.
     """
-    block, work = state.block, room.numbers
+    block, work = state.block, workspace.numbers
     learning = isinstance(state.source, TrialMotion)
-    efforts, following = room.sample[2], room.sample[3]
+    efforts, following = workspace.sample[2], workspace.sample[3]
     if learning and work.contact_watched:
         learn_loads(state.source.id, state, np.abs(block.command), efforts, following)  # type: ignore[union-attr]
     if not (work.contact and work.watches_loads):
         return None
-    limits = room.stated_load_limits if learning else room.load_limits
+    limits = workspace.stated_load_limits if learning else workspace.load_limits
     reason = worst_contact(block, settings, *limits, learning)
     if reason is not None:
         block.contact_low[:] = np.minimum(block.mean_efforts, efforts), np.minimum(following, 0.0)
@@ -277,14 +277,14 @@ class Situation(NamedTuple):
 
 
 @kernel
-def account_loads(block: Record, room: Record, halted: bool) -> tuple[bool, bool]:
-    """Update the load history of the ``block`` by the sample in the workspace ``room``. Returns whether the arm moves
+def account_loads(block: Record, workspace: Record, halted: bool) -> tuple[bool, bool]:
+    """Update the load history of the ``block`` by the sample in the ``workspace``. Returns whether the arm moves
     (is not ``halted``) and is monitored, and whether a joint is beyond a limit then: see `_account_loads`.
 
     Values that are missing or not finite are replaced by the expected ones, in the workspace, too. The block's command
     is still that of the last step.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, window = memory.joints, memory.window
     efforts, following = work.sample[2 * n : 3 * n], work.sample[3 * n : 4 * n]
     mean = memory.mean_efforts[:n]
@@ -381,11 +381,11 @@ FOLLOWS, LACKS, SILENT = range(3)
 """Results of `account_following`."""
 
 
-def explain_following(state: CoreState, settings: CoreSettings, room: Workspace) -> Reason | None:
+def explain_following(state: CoreState, settings: CoreSettings, workspace: Workspace) -> Reason | None:
     """The reason for the joint that does not follow (the worst one), from the result of `account_following` in this
     step; None if all joints follow.
     """
-    block, work = state.block, room.numbers
+    block, work = state.block, workspace.numbers
     if work.following == FOLLOWS:
         return None
     joint = work.worst
@@ -396,17 +396,17 @@ def explain_following(state: CoreState, settings: CoreSettings, room: Workspace)
 
 
 @kernel
-def account_following(block: Record, room: Record) -> int:
+def account_following(block: Record, workspace: Record) -> int:
     """Compare the travel since the last step with the last command, or with the velocity that the driver has sent in
     its place. Returns `FOLLOWS`, `LACKS` or `SILENT`; the joint and its missing travel are written to the workspace
-    ``room``.
+    ``workspace``.
 
     A joint's missing travel is its commanded minus its measured travel, with exponential forgetting over ``MEMORY_S``.
     Its limit is the travel in ``LAG_S`` at full speed, plus the travel explained by the drive's delay. Travel commanded
     to a joint whose reading does not change is not forgotten, so a slow command to a stuck encoder is detected, too.
     Without a new sample there is no decision.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s = memory.joints, work.elapsed_s
     q, command, answers = work.q[:n], memory.command[:n], work.answers[:n]
     if work.has_sent != 0:
@@ -422,9 +422,9 @@ def account_following(block: Record, room: Record) -> int:
     if memory.followed == 0:
         last[:], missing_late[:], delays.accounted[:] = q, 0.0, delays.sent
     fresh = memory.last_joints_ns != memory.last_followed_ns
-    account_travel(block, room, command, fresh, delays)
+    account_travel(block, workspace, command, fresh, delays)
     memory.delay_steps += 1
-    account_silence(block, room)
+    account_silence(block, workspace)
     if not fresh:
         return FOLLOWS
     memory.last_followed_ns, memory.followed = memory.last_joints_ns, 1
@@ -446,7 +446,7 @@ def account_following(block: Record, room: Record) -> int:
 
 def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
     """Collision: the arm stops with its drives on, as for a stop by a person."""
-    reason = explain_contact(context.state, context.settings, context.derived.room)
+    reason = explain_contact(context.state, context.settings, context.derived.workspace)
     if reason is None:
         return ()
     return (Finding("stop", reason, reason.hint, f"contact: {reason.hint}"),)
@@ -454,7 +454,7 @@ def monitor_collision(context: StepContext) -> tuple[Finding, ...]:
 
 def monitor_following(context: StepContext) -> tuple[Finding, ...]:
     """A joint does not follow its command: its encoder, brake or drive is faulty, so the cell goes to fault."""
-    reason = explain_following(context.state, context.settings, context.derived.room)
+    reason = explain_following(context.state, context.settings, context.derived.workspace)
     if reason is None:
         return ()
     return (Finding("fault", reason, reason.hint, reason.hint),)
@@ -507,19 +507,19 @@ QUIET = [NOISE] * OF
 
 def finish_round(context: StepContext) -> ModelDiagnosis | None:
     """Evaluate a round if one is complete; returns the new diagnosis if it has changed."""
-    state, arrays, work = context.state, context.arrays, context.derived.room.numbers
+    state, arrays, work = context.state, context.arrays, context.derived.workspace.numbers
     watching = state.watching
     if arrays is None:
         return None
-    if work.rounds_apart:
-        _judge_round_apart(context)
-    looked_at, odd, masked = work.looked_at, work.odd, work.any_masked
+    if work.rounds_in_python:
+        _judge_round_in_python(context)
+    looked_at, inconsistent, masked = work.looked_at, work.inconsistent, work.any_masked
     if not looked_at:
         return None
-    if not odd and not masked and watching.last == QUIET and watching.verdict == NOISE:
+    if not inconsistent and not masked and watching.last == QUIET and watching.verdict == NOISE:
         return None
     verdict = NOISE
-    if odd and not _all_late(_cameras(odd), watching, context.settings):
+    if inconsistent and not _all_late(_cameras(inconsistent), watching, context.settings):
         problem = present_problem(state, _cameras(looked_at), arrays, context.settings)
         found = diagnosed_beside_joint_errors(problem, proven=state.reanchoring is not None)
         verdict = beside_target(found, state)
@@ -529,17 +529,17 @@ def finish_round(context: StepContext) -> ModelDiagnosis | None:
     return _changed(watching)
 
 
-def _judge_round_apart(context: StepContext) -> None:
+def _judge_round_in_python(context: StepContext) -> None:
     """Run `judge_round` if a round is due, without the cameras that move. Readings from a faulty drive must not be used
     to judge cameras.
     """
-    state, room = context.state, context.derived.room
+    state, workspace = context.state, context.derived.workspace
     faulty = state.lifecycle is Lifecycle.FAULT or state.lifecycle is Lifecycle.UNCONFIGURED
     if faulty or not round_is_due(state.block.record):
         return
     moving = moving_camera.moving_bits(state) if any(state.mobile) else 0
-    work = room.numbers
-    work.looked_at, work.odd, work.any_masked = judge_round(state.block.record, room.record, moving)
+    work = workspace.numbers
+    work.looked_at, work.inconsistent, work.any_masked = judge_round(state.block.record, workspace.record, moving)
 
 
 def _cameras(bits: int) -> list[int]:
@@ -548,15 +548,15 @@ def _cameras(bits: int) -> list[int]:
 
 
 @kernel
-def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, bool]:
+def judge_round(block: Record, workspace: Record, moving: int) -> tuple[int, int, bool]:
     """Examine the newest frame of each camera. Returns the cameras with a recent frame; those of them whose innovations
     do not look like noise, of all markers together and of each; and whether any marker is masked.
 
     Sets of cameras are bit masks. Cameras in ``moving`` are ignored.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     rows, masked, now_ns = memory.rows, work.masked[: memory.markers], work.now_ns
-    known = odd = 0
+    known = inconsistent = 0
     for c in range(memory.cameras):
         frame, bit = memory.sightings[c], 1 << c
         age_s = (now_ns - frame.t_ns) * 1e-9
@@ -573,8 +573,8 @@ def judge_round(block: Record, room: Record, moving: int) -> tuple[int, int, boo
             MODEL_SIGMA_PX,
         )
         if not (chi2 <= work.noise_chi2[count] and largest <= work.gate):
-            odd |= bit
-    return known, odd, bool((masked > 0.0).any())
+            inconsistent |= bit
+    return known, inconsistent, bool((masked > 0.0).any())
 
 
 def _all_late(cameras: list[int], watching: ModelMonitor, settings: CoreSettings) -> bool:
@@ -668,7 +668,7 @@ def _compare_kept_model(context: StepContext) -> Findings:
     """Compare a kept model with the images at rest, by the test of the model monitor; the model is used once
     `COMPARED_ROUNDS` rounds in succession agree.
     """
-    state, looked_at = context.state, context.derived.room.numbers.looked_at
+    state, looked_at = context.state, context.derived.workspace.numbers.looked_at
     comparison, arrays = state.comparison, context.arrays
     if comparison is None or state.readiness is not ModelReadiness.UNCONFIRMED or not looked_at or arrays is None:
         return ()
@@ -737,7 +737,7 @@ def _refuses(state: CoreState) -> bool:
     )
 
 
-def looks_apart(state: CoreState) -> bool:
+def rounds_in_python(state: CoreState) -> bool:
     """Whether Python examines the rounds of frames: some cameras may move or are being relocalized."""
     return state.reanchoring is not None or any(state.mobile)
 
@@ -752,7 +752,7 @@ MONITORS: tuple[Monitor, ...] = (
     Monitor(
         "innovations",
         _monitor_innovations,
-        lambda state: state.watching.verdict.kind != "ok" or looks_apart(state),
+        lambda state: state.watching.verdict.kind != "ok" or rounds_in_python(state),
     ),
     Monitor("comparison", _compare_kept_model, lambda state: state.readiness is ModelReadiness.UNCONFIRMED),
     Monitor("model", _monitor_model, lambda state: state.readiness is ModelReadiness.SUSPECT),

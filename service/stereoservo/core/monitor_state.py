@@ -179,14 +179,14 @@ class ObservationStatistics(msgspec.Struct, eq=False, kw_only=True):
 
 
 class DriveDelays(NamedTuple):
-    """Delays of the joints' drives, and the travel missing apart from them; see `core.monitors.following`.
+    """Delays of the joints' drives, and the travel missing in addition to them; see `core.monitors.following`.
 
     ``delay_s`` (n,): the measured delays, 0 before the measurement and where they are negligible: the median of
     ``samples`` (k, n) [s].
     ``onset`` (7, n): the measurement in progress.
     ``sent`` (n,) [rad or m]: total commanded travel, and ``past`` (r, n) that of the last r steps.
     ``velocity`` (n,): the commands that take effect now.
-    ``under_way`` (n,): travel that is commanded and has not taken effect yet.
+    ``in_transit`` (n,): travel that is commanded and has not taken effect yet.
     ``missing`` (n,): recent effective minus measured travel.
     ``accounted`` (n,): effective travel at the last joint sample.
     """
@@ -197,6 +197,6 @@ class DriveDelays(NamedTuple):
     sent: FloatArray
     past: FloatArray
     velocity: FloatArray
-    under_way: FloatArray
+    in_transit: FloatArray
     accounted: FloatArray
     missing: FloatArray

@@ -180,7 +180,7 @@ def arrange_motion(context: StepContext) -> None:
     not its velocity. It does not move while it is paused, nor outside ACTIVE, where `execute_goals` ends it.
     """
     state, derived = context.state, context.derived
-    work, source, scale = derived.room.numbers, state.source, context.settings.limits.speed_scale
+    work, source, scale = derived.workspace.numbers, state.source, context.settings.limits.speed_scale
     kind = MOTION_SOURCES[type(source)]
     moves = bool(work.active) and not work.paused
     by_law = moves and kind.runs_law
@@ -198,28 +198,28 @@ def move(context: StepContext) -> None:
     state, derived = context.state, context.derived
     step, goal = derived.motion
     source: Any = state.source
-    output = drive(source, context) if context.goes_on else step(source, context)
+    output = drive(source, context) if context.stays_active else step(source, context)
     if output is not None:
         _put_output(output, context)
     if state.friction_of != goal:
         state.friction_of = goal
         if goal:
-            begin_friction(state.block.record, derived.room.record)
+            begin_friction(state.block.record, derived.workspace.record)
 
 
 def _put_output(output: SourceOutput, context: StepContext) -> None:
     """Write the output of a motion source in Python into the workspace."""
-    context.output, room = output, context.derived.room
-    work = room.numbers
-    room.velocity[:] = output.velocity
+    context.output, workspace = output, context.derived.workspace
+    work = workspace.numbers
+    workspace.velocity[:] = output.velocity
     work.rests, work.needs_features = False, output.needs_features
     work.speed_scale = output.speed_scale * context.settings.limits.speed_scale
     work.runs = work.runs and not output.finished
 
 
 @kernel
-def begin_friction(block: Record, room: Record) -> None:
+def begin_friction(block: Record, workspace: Record) -> None:
     """Reset the friction estimates; travel is compared from the current joint positions."""
     memory, n = block[0], block[0].joints
     memory.friction[:n] = memory.friction_sent[:n] = memory.friction_s[:n] = 0.0
-    memory.friction_from[:n] = room[0].q[:n]
+    memory.friction_from[:n] = workspace[0].q[:n]

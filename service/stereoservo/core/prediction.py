@@ -56,14 +56,14 @@ class FrameResiduals(msgspec.Struct, frozen=True, eq=False):
     """Residuals of one frame from the prediction at its shutter time, k rows: the model's markers, then its static
     points.
 
-    ``innovation`` (k, 2) [px], its covariance ``spread`` (k, 2, 2) from detector and timing, ``noise`` (k,) [px²]:
+    ``innovation`` (k, 2) [px], its covariance ``covariance`` (k, 2, 2) from detector and timing, ``noise`` (k,) [px²]:
     variance of a coordinate from the detector alone, whether it was ``seen`` (k,), and the ``velocity`` (k, 2) [px/s]
     caused by the joints.
     """
 
     t_shutter_ns: int
     innovation: FloatArray
-    spread: FloatArray
+    covariance: FloatArray
     noise: FloatArray
     seen: BoolArray
     velocity: FloatArray
@@ -106,9 +106,9 @@ def arm_in(arrays: ModelArrays) -> Arm:
 
 
 @inlined_kernel
-def arm_of(room: Record) -> Arm:
-    """The arm of the model in the workspace ``room``."""
-    work = room[0]
+def arm_of(workspace: Record) -> Arm:
+    """The arm of the model in the ``workspace``."""
+    work = workspace[0]
     n, m = work.joints, work.markers
     return Arm(
         work.generators[: 16 * n].reshape((n, 4, 4)),
@@ -262,7 +262,7 @@ def round_complete(block: Record) -> bool:
 
 @kernel
 def camera_chi2(
-    innovation: FloatArray, spread: FloatArray, used: FloatArray, model_px: float
+    innovation: FloatArray, covariance: FloatArray, used: FloatArray, model_px: float
 ) -> tuple[float, float, int, float, int]:
     """Chi-square of a frame's innovations (k, 2) with ``used`` (k,) > 0, sum of their squares [px²], the row of the
     largest squared distance (-1: none), this distance, and their number.
@@ -275,7 +275,7 @@ def camera_chi2(
         count += 1
         x, y = innovation[i, 0], innovation[i, 1]
         m = model_px * model_px
-        d2 = distance2(x, y, spread[i, 0, 0] + m, spread[i, 0, 1], spread[i, 1, 1] + m)
+        d2 = distance2(x, y, covariance[i, 0, 0] + m, covariance[i, 0, 1], covariance[i, 1, 1] + m)
         total += d2
         squares += x * x + y * y
         if worst < 0 or d2 > largest:
@@ -294,10 +294,10 @@ FURTHER_STEPS = 3
 
 
 @kernel
-def present(block: Record, room: Record) -> None:
+def present(block: Record, workspace: Record) -> None:
     """Estimate the current markers.
 
-    Written to the workspace ``room``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
+    Written to the ``workspace``, at the joints ``q`` (n,): the fields of a `Prediction`; ``weights`` (c, m)
     1/sigma [1/px] of recently seen markers, 0 for others; ``pixels`` (c, m, 2), the current markers: prediction plus
     held innovation. Written to the ``block``: the ``correction`` (n,) of the joints that explains the innovations best,
     so that the corrected points remain those of a rigid body.
@@ -305,9 +305,9 @@ def present(block: Record, room: Record) -> None:
     The correction is one Gauss-Newton step. If it is large (arms with play), further steps follow as long as they
     reduce the residual.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, cameras, markers = memory.joints, memory.cameras, memory.markers
-    arm, q = arm_of(room), work.q[:n]
+    arm, q = arm_of(workspace), work.q[:n]
     matrices = work.matrices[: 12 * cameras].reshape((cameras, 3, 4))
     innovation = memory.innovation[: 2 * cameras * markers].reshape((cameras, markers, 2))
     sigma, seen_ns = memory.sigma[: cameras * markers], memory.seen_ns[: cameras * markers]
@@ -336,8 +336,8 @@ def present(block: Record, room: Record) -> None:
             for k in range(2):
                 pixels[c, i, k] = predicted[c, i, k] + innovation[c, i, k]
             row_weights[2 * at] = row_weights[2 * at + 1] = weights[c, i]
-    apart = innovation.copy().reshape(-1)
-    step = joint_step(jacobian.reshape((-1, n)), apart, row_weights, CORRECTION_DAMPING)
+    residual = innovation.copy().reshape(-1)
+    step = joint_step(jacobian.reshape((-1, n)), residual, row_weights, CORRECTION_DAMPING)
     total, before = step.copy(), math.inf
     for _ in range(FURTHER_STEPS):
         large = False
@@ -345,16 +345,16 @@ def present(block: Record, room: Record) -> None:
             large = large or not abs(step[j]) < LARGE_CORRECTION
         if not large:
             break
-        _, _, there, rows = predict_markers(arm, q + total, matrices)
-        apart = (pixels - there).reshape(-1)
+        _, _, shown, rows = predict_markers(arm, q + total, matrices)
+        residual = (pixels - shown).reshape(-1)
         left = 0.0
-        for k in range(apart.size):
-            left += (row_weights[k] * apart[k]) ** 2
+        for k in range(residual.size):
+            left += (row_weights[k] * residual[k]) ** 2
         if not left < before:
             total = total - step
             break
         before = left
-        step = joint_step(rows.reshape((-1, n)), apart, row_weights, CORRECTION_DAMPING)
+        step = joint_step(rows.reshape((-1, n)), residual, row_weights, CORRECTION_DAMPING)
         total = total + step
     memory.correction[:n] = total
 
@@ -471,13 +471,13 @@ def propagate_covariance(a: float, b: float, d: float, C: FloatArray, out: Float
 
 
 @kernel
-def undistort_sights(
+def undistort_observations(
     lens: FloatArray, pixels: FloatArray, covariances: FloatArray
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """Ideal pixels (k, 2) with covariances (k, 2, 2) [px²] of raw ones, and which (k,) the lens can produce."""
     n = pixels.shape[0]
     ideal = np.empty((n, 2))
-    spread = np.empty((n, 2, 2))
+    covariance = np.empty((n, 2, 2))
     seen = np.empty(n, dtype=np.bool_)
     for i in range(n):
         u, v = undistort_pixel(lens, pixels[i, 0], pixels[i, 1])
@@ -485,5 +485,5 @@ def undistort_sights(
         a, b, d = distortion_jacobian(lens, u, v)
         determinant = a * d - b * b
         seen[i] = math.isfinite(u) and math.isfinite(v) and determinant > 0.0
-        propagate_covariance(d / determinant, -b / determinant, a / determinant, covariances[i], spread[i])
-    return ideal, spread, seen
+        propagate_covariance(d / determinant, -b / determinant, a / determinant, covariances[i], covariance[i])
+    return ideal, covariance, seen

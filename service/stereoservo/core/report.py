@@ -16,7 +16,7 @@ from stereoservo.core.cycle import NOT_MEASURED, Status
 from stereoservo.core.estimate import masked_ids
 from stereoservo.core.goals.execute import finish
 from stereoservo.core.goals.plan import planning_reason
-from stereoservo.core.model_arrays import FIRST_SIGHT_SIGMA_PX, ModelArrays
+from stereoservo.core.model_arrays import FIRST_SEEN_SIGMA_PX, ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
 from stereoservo.core.monitors import camera_relocalization, moving_camera
 from stereoservo.core.monitors.diagnosis import diagnosis_reason
@@ -40,11 +40,11 @@ def finish_step(context: StepContext, limits: SafetyLimits) -> None:
     """
     state, output = context.state, context.output
     if output is not None:
-        context.derived.room.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
+        context.derived.workspace.result[0] = NOT_MEASURED if output.error_px is None else output.error_px
         if output.finished:
             finish(output, context)
     state.step += 1
-    if state.step % context.derived.look_every or not context.derived.room.numbers.runs:
+    if state.step % context.derived.check_every or not context.derived.workspace.numbers.runs:
         return
     source = state.source
     examine = MOTION_SOURCES[type(source)].examine
@@ -87,7 +87,7 @@ def motion_of(context: StepContext) -> SourceOutput:
     if context.output is not None:
         return context.output
     source = context.state.source
-    if isinstance(source, ServoGoal) and not context.derived.room.numbers.rests:
+    if isinstance(source, ServoGoal) and not context.derived.workspace.numbers.rests:
         return found_by_kernel(source, context)
     return NO_MOTION
 
@@ -114,7 +114,7 @@ def _reasons_before(context: StepContext, limited: SafetyResult) -> list[Reason]
 def _reasons(context: StepContext, found: list[Reason]) -> tuple[Reason, ...]:
     """All reasons: those ``found`` before, and those of the last examination of a law's run."""
     state = context.state
-    if context.derived.room.numbers.runs and isinstance(state.source, LawRun):
+    if context.derived.workspace.numbers.runs and isinstance(state.source, LawRun):
         codes = {reason.code for reason in found}
         found.extend([reason for reason in state.source.reasons if reason.code not in codes])
     if state.planning is not None:
@@ -148,7 +148,7 @@ def priors_of(context: StepContext) -> tuple[Prior, ...]:
     moving: list[int] = []
     unknown: tuple[str, ...] = ()
     if state.reanchoring is not None or any(state.mobile):
-        prediction, moving, unknown = moving_camera.to_look_from(arrays, context)
+        prediction, moving, unknown = moving_camera.prediction_for_priors(arrays, context)
     return priors(arrays, context, prediction, moving, unknown)
 
 
@@ -248,7 +248,7 @@ def priors(
     Earlier observations of cameras that are ``moving`` are not used. Cameras whose pose is ``unknown`` have no prior:
     their detectors search the whole image.
     """
-    state, room, now_ns = context.state, context.derived.room, context.now_ns
+    state, room, now_ns = context.state, context.derived.workspace, context.now_ns
     shape = prediction.pixels.shape
     expected = Expected(np.empty(shape), np.empty(shape), np.empty((*shape, 2)))
     pixels, speed, covariance = expected
@@ -328,7 +328,7 @@ def expect_sights(
 def _unseen_sigma(jacobian: FloatArray, arrays: ModelArrays) -> FloatArray:
     """Standard deviations (c, m) [px] of markers that were not seen recently, from their ``jacobian`` (c, m, 2, n)."""
     by_joints: FloatArray = (jacobian**2 * arrays.joint_variances).sum(axis=-1).max(axis=-1)
-    return np.asarray(np.minimum(np.sqrt(FIRST_SIGHT_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
+    return np.asarray(np.minimum(np.sqrt(FIRST_SEEN_SIGMA_PX**2 + by_joints), LARGEST_WINDOW_PX))
 
 
 @kernel

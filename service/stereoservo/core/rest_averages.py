@@ -46,14 +46,14 @@ def add_observation(
     sums: ObservationStatistics,
     settings: CoreSettings,
     observation: CameraObservation,
-    frames_wanted: int,
+    frames_required: int,
     after_ns: int,
 ) -> bool:
     """Add one frame if it is stamped after ``after_ns`` and its camera needs more frames; returns
     whether it was used.
     """
     camera = next(i for i, c in enumerate(settings.cameras) if c.name == observation.camera)
-    if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_wanted:
+    if observation.t_shutter_ns <= after_ns or sums.frames[camera] >= frames_required:
         return False
     sums.frames[camera] += 1
     found = marker_rows(settings, observation.ids)

@@ -30,8 +30,8 @@ from stereoservo.core.estimate import (
     load_limits,
     note_frames,
     offset_rules,
-    place_unknown,
-    take_frames_apart,
+    pose_unknown,
+    take_frames_in_python,
     take_model,
     workspace,
 )
@@ -47,12 +47,12 @@ from stereoservo.core.ingest import (
     put_inputs,
 )
 from stereoservo.core.model_arrays import model_arrays
-from stereoservo.core.monitor import NOISE, QUIET, detect, looks_apart, monitor, monitors_attend
+from stereoservo.core.monitor import NOISE, QUIET, detect, monitor, monitors_attend, rounds_in_python
 from stereoservo.core.monitors import moving_camera
 from stereoservo.core.move import MOTION_SOURCES, arrange_motion, move, paused
 from stereoservo.core.report import finish_step, priors_of, status_of
 from stereoservo.core.settings import CoreSettings
-from stereoservo.core.sources.law import aim_at, by_kernel, follow_goal
+from stereoservo.core.sources.law import by_kernel, follow_goal, set_goal
 from stereoservo.core.state import (
     CoreState,
     Holding,
@@ -75,25 +75,26 @@ def observe(context: StepContext, *, decides: bool) -> int:
     ``decides`` or anything was detected, the active goal may change, so its law measures the progress itself.
     """
     derived = context.derived
-    room, block = derived.room, context.state.block
-    work, record, space = room.numbers, block.record, room.record
+    workspace, block = derived.workspace, context.state.block
+    work, record, space = workspace.numbers, block.record, workspace.record
     found = ingest(record, space)
     if work.frames_as_stops:
-        take_frames_apart(context)
+        take_frames_in_python(context)
     if derived.arrays is None:
         note_frames(record, space)
     else:
         estimate(record, space)
         if block.numbers.history_count:
             context.arrays = context.moved_arrays or derived.arrays
-            context.prediction, context.weights, context.pixels = room.prediction, room.weights, room.pixels
+            context.prediction, context.weights = workspace.prediction, workspace.weights
+            context.pixels = workspace.pixels
     found |= detect(record, space)
-    context.goes_on = bool(work.aims) and not found and not decides and follow_goal(record, space)
+    context.stays_active = bool(work.has_goal) and not found and not decides and follow_goal(record, space)
     return found
 
 
 PRIOR_RATE_HZ = 125.0
-LOOK_EVERY_S = 0.2
+CHECK_EVERY_S = 0.2
 """Interval between two examinations of why a law is slow or stuck [s]."""
 BY_KERNELS = (ServoGoal, Holding)
 """Motion sources whose steps do not read the inputs."""
@@ -138,12 +139,12 @@ class NewestStep:
     @property
     def raw(self) -> FloatArray:
         """Velocity (n,) before the safety stage."""
-        return self._context.derived.room.raw
+        return self._context.derived.workspace.raw
 
     @property
     def values(self) -> FloatArray:
         """As in `core.cycle.StepResult`."""
-        return self._context.derived.room.result
+        return self._context.derived.workspace.result
 
     @property
     def priors(self) -> tuple[Prior, ...]:
@@ -174,9 +175,9 @@ class ServoCore:
             features_fresh_s=fresh_s,
             laws=LAWS.usable(),
             cameras={camera.name: k for k, camera in enumerate(settings.cameras)},
-            room=workspace(settings, model),
+            workspace=workspace(settings, model),
             prior_every=max(1, round(settings.rate_hz / PRIOR_RATE_HZ)),
-            look_every=max(1, round(settings.rate_hz * LOOK_EVERY_S)),
+            check_every=max(1, round(settings.rate_hz * CHECK_EVERY_S)),
             load_limits=load_limits(settings, model),
         )
         if model is not None:
@@ -192,8 +193,8 @@ class ServoCore:
 
     def _put_limits(self) -> None:
         """Write the limits of the safety stage and the longest ages of inputs into the workspace."""
-        derived, given = self._derived, self._derived.room.arrays
-        work, limits = derived.room.numbers, self._limits
+        derived, given = self._derived, self._derived.workspace.arrays
+        work, limits = derived.workspace.numbers, self._limits
         given["limits"][:], given["bounds"][:] = limits.table, limits.bounds
         work.nominal_s, work.longest_gap_s = derived.nominal_period_ns * 1e-9, derived.longest_gap_s
         work.frame_timeout_s = derived.frame_timeout_s
@@ -222,15 +223,15 @@ class ServoCore:
         if context.ingested is NOTHING and not isinstance(state.source, BY_KERNELS):
             context.ingested = account_inputs(context)
         move(context)
-        room = self._derived.room
-        command(state.block.record, room.record, self._limits.keep_outs)
+        workspace = self._derived.workspace
+        command(state.block.record, workspace.record, self._limits.keep_outs)
         finish_step(context, self._limits)
         if context.output is not None:  # Python has moved the arm, and may have changed any state
             self._arranged = None
 
     def _prepare(self, context: StepContext) -> None:
         """Prepare a step: update the driver's lifecycle, and put a pending model in use."""
-        state, inputs, work = context.state, context.inputs, self._derived.room.numbers
+        state, inputs, work = context.state, context.inputs, self._derived.workspace.numbers
         if state.source is not self._arranged:
             self._arrange(context)
         work.active_before = work.active
@@ -267,34 +268,34 @@ FAULTY = (Lifecycle.FAULT, Lifecycle.UNCONFIGURED)
 def arrange(context: StepContext) -> None:
     """Write the state that holds until the next decision into the workspace."""
     state, settings, derived = context.state, context.settings, context.derived
-    room, watching, kind = derived.room, state.watching, MOTION_SOURCES[type(state.source)]
-    work, given = room.numbers, room.arrays
+    workspace, watching, kind = derived.workspace, state.watching, MOTION_SOURCES[type(state.source)]
+    work, given = workspace.numbers, workspace.arrays
     work.active, work.faulty = state.lifecycle is Lifecycle.ACTIVE, state.lifecycle in FAULTY
     work.stopped, work.by_images = state.stopped, kind.by_images
     work.learning = isinstance(state.source, TrialMotion)
-    work.rounds_apart = looks_apart(state)
+    work.rounds_in_python = rounds_in_python(state)
     work.frames_as_stops = any(state.mobile) or state.target is not None
     work.quiet = watching.last == QUIET and watching.verdict == NOISE
     work.paused = paused(state)
     if derived.arrays is not None:
         given["masked"][:] = watching.masked
     for c, (rule, stated_ns) in enumerate(offset_rules(state, settings)):
-        given["unknown"][c] = place_unknown(c, state, settings)
+        given["unknown"][c] = pose_unknown(c, state, settings)
         given["offset_rule"][c], given["stated_offset_ns"][c] = rule, stated_ns
     inexact = state.model is not None and state.model.joint_accuracy is not None
     given["friction_most"][:], given["friction_travel"][:] = friction_bounds(
         settings.joint_kinds, settings.resolution, inexact
     )
     source = state.source
-    work.aims = (
+    work.has_goal = (
         isinstance(source, ServoGoal)
         and derived.arrays is not None
         and by_kernel(source, derived.laws[source.law])
         and bool(work.active)
         and not work.paused
     )
-    if work.aims and isinstance(source, ServoGoal):
-        aim_at(room, source)
+    if work.has_goal and isinstance(source, ServoGoal):
+        set_goal(workspace, source)
     arrange_motion(context)
 
 

@@ -381,15 +381,15 @@ def _trial_settings(cell: CellFile, joints: JointDriverDescription) -> TrialSett
         limit = next(limit for limit in cell.safety.limit if limit.joint == spread.joint)
         coarse = 2.0 * ARRIVAL_STEPS * joints.joints[spread_joint].resolution
         base, margin = section.base[spread.joint], cell.safety.position_margin + max(SLACK, coarse)
-        room = min(limit.max - margin - base, base - limit.min - margin)
-        wanted = spread.range or section.range.get(spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind])
-        if spread.range is not None and spread.range > room:
+        remaining = min(limit.max - margin - base, base - limit.min - margin)
+        requested = spread.range or section.range.get(spread.joint, LARGEST_RANGE[joints.joints[spread_joint].kind])
+        if spread.range is not None and spread.range > remaining:
             raise CellFileError(
                 cell.cell.name,
                 "calibration.spread.range",
-                f"is {spread.range:g}; joint {spread.joint!r} has {room:.4g} to either side of its base",
+                f"is {spread.range:g}; joint {spread.joint!r} has {remaining:.4g} to either side of its base",
             )
-        offsets = np.linspace(-1.0, 1.0, spread.positions) * min(wanted, room)
+        offsets = np.linspace(-1.0, 1.0, spread.positions) * min(requested, remaining)
     return TrialSettings(
         base=np.array([section.base[name] for name in names]),
         range=np.array([section.range.get(name, np.nan) for name in names]),

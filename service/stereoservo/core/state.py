@@ -32,7 +32,7 @@ from stereoservo.planning.path_search import PlanningState
 from stereoservo.planning.plan import Plan
 
 STATE_VERSION = 13
-LEAST_APART_NS = 2_500_000  # between samples that are kept, except the newest
+LEAST_SEPARATION_NS = 2_500_000  # between samples that are kept, except the newest
 
 
 class JointHistory(msgspec.Struct, eq=False):
@@ -500,15 +500,15 @@ def initial_state(settings: CoreSettings) -> CoreState:
         mobile=[None for _ in settings.cameras],
         adjusted=(),
     )
-    share_sights(state)
+    share_observations(state)
     return state
 
 
-def share_sights(state: CoreState) -> None:
+def share_observations(state: CoreState) -> None:
     """Move the cameras' estimates and their newest frames into the block."""
     block, frames = state.block, state.watching.sightings
     markers, rows = (state.cameras[0].sigma.size, frames[0].seen.size) if frames else (0, 0)
-    block.begin_sights(markers, rows)
+    block.begin_observations(markers, rows)
     for here, camera in zip(block.estimates, state.cameras, strict=True):
         here.become(camera)
     for seen, frame in zip(block.sightings, frames, strict=True):

@@ -10,7 +10,7 @@ import msgspec
 from stereoservo.core.block import Block, restored
 from stereoservo.core.camera_state import CameraEstimate, CameraMonitor, CameraTiming, camera_read
 from stereoservo.core.cycle import decode_array, encode_array
-from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_sights
+from stereoservo.core.state import STATE_VERSION, CoreState, Refused, ServoGoal, share_observations
 
 OLDEST_VERSION = 6
 """Oldest version of states that can be read."""
@@ -68,7 +68,7 @@ def decode_state(data: bytes) -> CoreState:
     if version < STATE_VERSION:
         data = msgspec.msgpack.encode(_of_this_version(msgspec.msgpack.decode(data), version))
     state: CoreState = _decoder.decode(data)
-    share_sights(state)
+    share_observations(state)
     job = state.planning
     if job is not None and job.purpose == "again" and isinstance(state.source, ServoGoal):
         job.source = state.source  # written twice, but one object

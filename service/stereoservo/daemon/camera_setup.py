@@ -84,11 +84,11 @@ class RecordedCamera:
     detector: Detector
 
     def observations(
-        self, log: Callable[[str], None], wanted: Callable[[int], bool] = lambda t_shutter_ns: True
+        self, log: Callable[[str], None], accepts: Callable[[int], bool] = lambda t_shutter_ns: True
     ) -> Iterator[CameraObservation]:
         """Observations of the frames in order, detected without priors; stamps are those of the recording.
 
-        Markers are detected only in frames whose shutter time is ``wanted``; ``log`` is called if a file is truncated.
+        Markers are detected only in frames whose shutter time is ``accepts``; ``log`` is called if a file is truncated.
         Raises DriverError for a damaged file or an image of another size.
         """
         try:
@@ -105,7 +105,7 @@ class RecordedCamera:
                     return
                 for frame in arrived:
                     assert isinstance(frame, Frame)
-                    if wanted(frame.t_shutter_ns):
+                    if accepts(frame.t_shutter_ns):
                         yield rounded(self.detector.detect(frame, None))
         finally:
             self.driver.deactivate()

@@ -19,7 +19,7 @@ import msgspec
 from stereoservo.control.law_registry import LAWS
 from stereoservo.daemon.camera_setup import describe_camera, make_camera
 from stereoservo.daemon.ipc_messages import PlanOptions, RunPlan, save_plan
-from stereoservo.daemon.kernel_compilation import collect_seldom, tell_progress, warm_up_first
+from stereoservo.daemon.kernel_compilation import collect_seldom, report_progress, warm_up_first
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
 from stereoservo.ports import plugins
@@ -69,7 +69,7 @@ def describe_cell(
             "auxiliary",
             f"joint driver {cell.joints.driver!r} declares auxiliary joints or outputs "
             f"({', '.join(spec.name for spec in joints.auxiliary)}), and lacks write_auxiliary, read_auxiliary or "
-            "stop_auxiliary: orders would be told as obeyed",
+            "stop_auxiliary: commands would be reported as executed",
         )
     if joints.pacing != "clock":
         raise CellFileError(
@@ -111,7 +111,7 @@ def main() -> int:
     die_with_parent(int(sys.argv[4]), signal.SIGKILL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     collect_seldom()
-    tell_progress(runtime, "first", int(sys.argv[4]))
+    report_progress(runtime, "first", int(sys.argv[4]))
     try:
         plan = make_plan(cell_path, runtime, state, msgspec.json.decode(sys.argv[5], type=PlanOptions))
     except (CellFileError, DriverError, plugins.PluginError) as error:

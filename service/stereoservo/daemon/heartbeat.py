@@ -112,7 +112,7 @@ class HeartbeatReader:
 class HangWatch:
     """Watchdog of one process.
 
-    Time is measured from the moment at which the watchdog read a beat, not from the beat itself, so that delays of the
+    Time is measured from the time at which the watchdog read a beat, not from the beat itself, so that delays of the
     watchdog do not count as a hang.
     """
 
@@ -126,7 +126,7 @@ class HangWatch:
         self._reader.newest()
         self._limit_s = None
 
-    def look(self, now_s: float, *, late: bool = False) -> str:
+    def check(self, now_s: float, *, late: bool = False) -> str:
         """Description of how the process hangs, '' if it does not. ``late``: the watchdog itself was late, so the
         measurement starts again.
         """

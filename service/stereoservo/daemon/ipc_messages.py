@@ -201,7 +201,7 @@ def encode_observation(observation: CameraObservation) -> bytes:
 
 def decode_observation(data: bytes) -> CameraObservation:
     """Inverse of :func:`encode_observation`. Raises ValueError, before anything is allocated."""
-    name, k, (seq, shutter_ns, received_ns), numbers = _apart(data, _OBSERVATION, 7)
+    name, k, (seq, shutter_ns, received_ns), numbers = _split_message(data, _OBSERVATION, 7)
     return CameraObservation(
         name,
         seq,
@@ -222,7 +222,7 @@ def encode_prior(prior: Prior) -> bytes:
 
 def decode_prior(data: bytes) -> Prior:
     """Inverse of :func:`encode_prior`. Raises ValueError, before anything is allocated."""
-    name, k, (t_ns,), numbers = _apart(data, _PRIOR, 9)
+    name, k, (t_ns,), numbers = _split_message(data, _PRIOR, 9)
     return Prior(
         name,
         t_ns,
@@ -239,7 +239,7 @@ def _places(ids: IntArray, *numbers: FloatArray) -> bytes:
     return b"".join(parts)
 
 
-def _apart(data: bytes, head: struct.Struct, words: int) -> tuple[str, int, tuple[int, ...], bytearray]:
+def _split_message(data: bytes, head: struct.Struct, words: int) -> tuple[str, int, tuple[int, ...], bytearray]:
     """Camera, number of markers, numbers of the head, and ``words`` words of 8 bytes per marker."""
     if len(data) < head.size:
         raise ValueError(f"{len(data)} bytes; the head alone has {head.size}")

@@ -31,7 +31,7 @@ import msgspec
 import numba
 import numpy as np
 
-from stereoservo.control.faces import spread_in_images
+from stereoservo.control.faces import spaced_in_images
 from stereoservo.control.incidence import (
     image_task,
     incidence_freedoms,
@@ -79,7 +79,7 @@ from stereoservo.messages.goals import (
     UpdateGoal,
 )
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.numerics.compilation import load, overloads, tell_compiled
+from stereoservo.numerics.compilation import load, overloads, report_compiled
 from stereoservo.numerics.kernel_cache import KERNELS, SHIPPED, Overload, file_hash, shipped_folder
 from stereoservo.planning.plan import PlanLimits, PlanRequest
 from stereoservo.planning.planner import plan
@@ -149,8 +149,8 @@ def _warm_up_goals() -> None:
         np.arange(len(MARKERS)),
         np.ones(pixels.shape[:2]),
     )  # a body of many markers, of which some are taken
-    spread_in_images(few, pixels, seen)
-    spread_in_images(few, pixels, seen, 3)
+    spaced_in_images(few, pixels, seen)
+    spaced_in_images(few, pixels, seen, 3)
     distort_pixel(LENS, 1.0, 1.0)  # for set-points that are recomputed for a moved camera
     self_motion_from_limits(np.ones((8, 7)), 0.5 * seven, -seven, seven, 1.0)
     adaptive_gain(1.0, 2.0, 1.0, 1.0)
@@ -223,7 +223,7 @@ def _warm_up_following(mount: Mount) -> None:
     others = model.marker_points + np.array([0.15, 0.1, 0.1, 0.0])
     ids = MARKERS if mount == "eye_in_hand" else OTHERS
     shown = {name: _by_marker(OTHERS, seen) for name, seen in zip(CAMERAS, _seen(model, others), strict=True)}
-    wanted = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)}
+    required = {name: _by_marker(MARKERS, seen) for name, seen in zip(CAMERAS, _example_pixels(model), strict=True)}
     at = tuple(float(height) for height in model.marker_points[0])
     corner = IncidenceSpec(
         "point-on-point", Feature(markers=(MARKERS[0],)), Feature(points=((at[0], at[1], at[2], at[3]),))
@@ -231,13 +231,13 @@ def _warm_up_following(mount: Mount) -> None:
     for follow_seen in ({}, shown)[: 1 if ids is MARKERS else 2]:
         core = ServoCore(settings)
         for step in range(1, STEPS):
-            way = np.array([1e-4 * step + (0.05 if step > STEPS // 2 else 0.0), 0.0, 0.0, 0.0])
-            body = model.marker_points + (way if ids is MARKERS else 0.0 * way)
-            pixels = np.concatenate([_seen(model, body), _seen(model, others + way)], axis=1)
+            offset = np.array([1e-4 * step + (0.05 if step > STEPS // 2 else 0.0), 0.0, 0.0, 0.0])
+            body = model.marker_points + (offset if ids is MARKERS else 0.0 * offset)
+            pixels = np.concatenate([_seen(model, body), _seen(model, others + offset)], axis=1)
             inputs = _inputs(step, pixels, model, MARKERS + OTHERS)
             goal = Goal(
                 "00000000-0000",
-                FeatureTarget(wanted),
+                FeatureTarget(required),
                 law=DEFAULT_LAW,
                 follow_markers=ids,
                 follow_seen=follow_seen,
@@ -393,7 +393,7 @@ class ShippedRecord(NamedTuple):
         """The ``made_by`` of kernels that this process can load."""
         return sys.implementation.cache_tag or "", platform.machine(), numba.__version__, llvmlite.__version__
 
-    def misfit(self) -> str:
+    def rejection_reason(self) -> str:
         """Reason why these kernels cannot be used, as text; '' if they can."""
         if self.made_by != self.maker():
             return f"made by {' '.join(self.made_by)}, here are {' '.join(self.maker())}"
@@ -452,7 +452,7 @@ def compiled() -> tuple[Overload, ...] | None:
     found = _cached_overloads()
     if found is None:
         shipped = _shipped()
-        found = None if shipped is None or shipped.misfit() else shipped.overloads
+        found = None if shipped is None or shipped.rejection_reason() else shipped.overloads
     return found
 
 
@@ -495,7 +495,7 @@ class KernelLoader:
     while nothing moves and a cycle may be late.
     """
 
-    LOOK_NS = 500_000_000
+    CHECK_NS = 500_000_000
     PAUSE_NS = 20_000_000
     """Pause between two kernels [ns], in which commands are sent to the drives."""
 
@@ -511,7 +511,7 @@ class KernelLoader:
         if self.loaded or now_ns < self._due_ns:
             return
         if self._loading is None:
-            self._due_ns = now_ns + self.LOOK_NS
+            self._due_ns = now_ns + self.CHECK_NS
             stamp = _stamp(self._record)
             if stamp != self._known:
                 self._known = stamp
@@ -547,15 +547,15 @@ def wait_until_compiled(given_up: Callable[[], bool]) -> None:
         os.close(lock)
 
 
-def tell_progress(runtime: Path, part: str, daemon: int, total: int = 0) -> None:
+def report_progress(runtime: Path, part: str, daemon: int, total: int = 0) -> None:
     """Make this process report in a cell's runtime directory how many kernels it has compiled, of about ``total``."""
     path = progress_path(runtime, part)
 
-    def tell(done: int) -> None:
+    def report(done: int) -> None:
         with suppress(OSError):  # a full disk or a missing directory must not end the compilation
             path.write_bytes(msgspec.json.encode(CompilationProgress(part, daemon, done, total)))
 
-    tell_compiled(tell)
+    report_compiled(report)
 
 
 def collect_seldom() -> None:
@@ -575,12 +575,12 @@ def main() -> int:
     elif _has_cache():
         if sys.argv[2:3] in ([BESIDE], [ALONE]):
             os.nice(NICE if sys.argv[2] == BESIDE else 0)
-            tell_progress(Path(sys.argv[3]), "rest", int(sys.argv[1]), KERNELS_IN_ALL)
+            report_progress(Path(sys.argv[3]), "rest", int(sys.argv[1]), KERNELS_IN_ALL)
         _wait_for_others()
         if compiled() is None:
             shipped = _shipped()
             if shipped is not None:
-                print(f"{SHIPPED}: {shipped.misfit()}; compiling instead", file=sys.stderr)
+                print(f"{SHIPPED}: {shipped.rejection_reason()}; compiling instead", file=sys.stderr)
             collect_seldom()
             warm_up()
             with_groups(example_model())  # in fits and the gateway: no servo process loads these
@@ -607,14 +607,14 @@ def warm_up_laws(*, own: bool = True) -> None:
     operators = np.concatenate([twist_matrix(np.zeros(3), np.eye(3)), twist_matrix(np.eye(3), np.zeros(3))])
     K = np.array([[800.0, 0, 320], [0, 800, 240], [0, 0, 1]])
     matrices = np.stack([K @ np.hstack([np.eye(3), np.array([[x], [0], [1.0]])]) for x in (0.1, -0.1)])
-    eyes = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
+    centres = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
     points = np.array([[0, 0, 0, 1], [0.1, 0, 0, 1], [0, 0.1, 0, 1.0]])
     targets = points + np.array([0.01, 0.02, 0.03, 0.0])
-    pixels, wanted = project_points(matrices, points)[0], project_points(matrices, targets)[0]
+    pixels, required = project_points(matrices, points)[0], project_points(matrices, targets)[0]
     ones = np.ones((2, 3))
-    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, eyes, points, pixels, ones)
+    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, centres, points, pixels, ones)
     task = Task(
-        wanted, ones, np.zeros_like(wanted), targets, np.ones(3), points.mean(axis=0), targets.mean(axis=0),
+        required, ones, np.zeros_like(required), targets, np.ones(3), points.mean(axis=0), targets.mean(axis=0),
         np.arange(3),
     )  # fmt: skip
     for name, law in list(LAWS.items()):
@@ -635,8 +635,8 @@ def warm_up_incidences() -> None:
     infinity = np.array([0, 0, 0, 1.0])
     pixels = np.einsum("cij,mj->cmi", matrices, points)
     pixels = pixels[..., :2] / pixels[..., 2:]
-    eyes = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
-    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, eyes, points, pixels, np.ones((2, 3)))
+    centres = np.array([[-0.1, 0, -1, 1], [0.1, 0, -1, 1.0]])
+    scene = Scene(operators, int(Composition.BASE_FIRST), matrices, centres, points, pixels, np.ones((2, 3)))
     task = incidence_task(
         ["plane-on-plane"],
         [[0, 1, 2]],
@@ -700,7 +700,7 @@ def _request() -> PlanRequest:
     camera = np.array([[600.0, 0.0, 320.0, 0.0], [0.0, 600.0, 240.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
     matrices = np.stack([camera, camera])
     matrices[:, 0, 3] = 60.0, -60.0
-    eyes = np.array([[-0.1, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 1.0]])
+    centres = np.array([[-0.1, 0.0, 0.0, 1.0], [0.1, 0.0, 0.0, 1.0]])
     corners = 0.05 * np.array([[-1.0, -1.0, 0.0], [1.0, -1.0, 0.0], [1.0, 1.0, 0.0], [-1.0, 1.0, 0.0]])
     turned = np.stack([-corners[:, 1], corners[:, 0], corners[:, 2]], axis=1)
     aside = np.array([AWAY, 0.0, 0.0])
@@ -709,7 +709,7 @@ def _request() -> PlanRequest:
         composition=0,
         joints=np.zeros(6),
         matrices=matrices,
-        camera_centres=eyes,
+        camera_centres=centres,
         points=_of_height_1(start + corners),
         targets=_of_height_1(start + aside + turned),
         must_stay_visible=np.ones(4),

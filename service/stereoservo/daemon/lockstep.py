@@ -358,12 +358,12 @@ class LockstepCell:
         for _ in range(round(seconds * 1e9 / self.period_ns)):
             self.step()
 
-    def wait_for(self, wanted: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
+    def wait_for(self, accepts: Callable[[Event], bool], timeout_s: float, since: int = 0) -> Event:
         """Step until an event with number > ``since`` matches. Raises LockstepTimeoutError."""
         seen = 0
         for _ in range(round(timeout_s * 1e9 / self.period_ns) + 1):
             for event in self.events[seen:]:
-                if event.seq > since and wanted(event):
+                if event.seq > since and accepts(event):
                     return event
             seen = len(self.events)
             self.step()

@@ -140,13 +140,13 @@ class LoggedPacing(ClockPacing):
         super().__init__(period_ns)
         with path.open("r+b") as file:
             self._log = mmap.mmap(file.fileno(), 0)
-        self._room = len(self._log) // CYCLE_BYTES - 1
+        self._capacity = len(self._log) // CYCLE_BYTES - 1
 
     def wait(self) -> int:
         """Sleep until the next slot, and log it; returns the time of waking [ns]."""
         work, skipped = self._now() - self._woke, self.skipped
         woke = super().wait()
-        if self.cycles <= self._room:
+        if self.cycles <= self._capacity:
             row = (woke, woke - self._deadline, work, self.skipped - skipped)
             _CYCLE.pack_into(self._log, self.cycles * CYCLE_BYTES, *row)
             self._log[:8] = self.cycles.to_bytes(8, sys.byteorder)

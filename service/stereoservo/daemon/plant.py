@@ -104,7 +104,7 @@ class PlantProcess:
         return self._clock.now_ns() - self._moved_ns < SETTLES_NS
 
     def _repeats(self, orders: Orders) -> bool:
-        """Whether these orders only repeat the order to stay at rest, which was sent to the drives a moment ago."""
+        """Whether these orders only repeat the order to stay at rest, which was sent to the drives just before."""
         done = self._done
         return (
             orders.velocity_number != done.velocity_number  # nothing else is new

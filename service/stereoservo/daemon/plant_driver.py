@@ -1,8 +1,8 @@
 """The joint driver of a simulated cell in the servo process: the drives themselves run in the process `plant`, as real
 drives are outside this computer; and the records that the two exchange.
 
-Only the newest record is kept in each direction. `Orders` hold the wanted state and counters of requests, so a missed
-record loses nothing; a plant executes only orders that are addressed to its session, and starts without power.
+Only the newest record is kept in each direction. `Orders` hold the commanded state and counters of requests, so a
+missed record loses nothing; a plant executes only orders that are addressed to its session, and starts without power.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ APPEARS_S = 4.0
 """Time for which a call waits for a plant that is being started [s]; the call may be repeated."""
 CALL_S = 10.0
 """Time for which a call waits for its answer [s]."""
-LOOK_S = 0.0005
+POLL_S = 0.0005
 SILENT_NS = 20_000_000
 """Time without a sample after which the plant's process is checked [ns]."""
 
@@ -182,7 +182,7 @@ class PlantDriver:
         """Make the plant set up its drives, without power; also finds a restarted plant. Raises DriverError."""
         until_ns = self._clock.now_ns() + round(APPEARS_S * 1e9)
         while True:
-            state = self._look()
+            state = self._poll()
             if state is not None and self._lives():
                 self._failures = state.failures
                 try:
@@ -198,7 +198,7 @@ class PlantDriver:
                     "supervisor: try again",
                     retry=True,
                 )
-            self._sleep(LOOK_S)
+            self._sleep(POLL_S)
 
     def activate(self) -> None:
         """Power on, at rest. Raises DriverError."""
@@ -239,7 +239,7 @@ class PlantDriver:
                     f"the process of the simulated drives did not answer for {CALL_S:g} s; is the computer overloaded?",
                     retry=True,
                 )
-            self._sleep(LOOK_S)
+            self._sleep(POLL_S)
         self._raise_failure(state)
 
     # -- motion ---------------------------------------------------------------------------------------------
@@ -249,7 +249,7 @@ class PlantDriver:
         state = self._state_of_session()
         self._raise_failure(state)
         if state.seq == 0:
-            raise DriverError("no_sample", "the simulated drives have told no positions yet", retry=True)
+            raise DriverError("no_sample", "the simulated drives have reported no positions yet", retry=True)
         return state.sample()
 
     def write_velocity(self, qd: FloatArray) -> CommandReport:
@@ -312,7 +312,7 @@ class PlantDriver:
         if not self._closed:  # `stop` may be called after `close`; the power is off then
             self._writer.write(self._orders.encoded())
 
-    def _look(self) -> PlantState | None:
+    def _poll(self) -> PlantState | None:
         """The newest state of any plant; None before the first."""
         record = self._reader.poll()
         if record is not None:
@@ -324,7 +324,7 @@ class PlantDriver:
 
     def _state_of_session(self) -> PlantState:
         """The newest state of the configured plant. Raises DriverError if it has ended."""
-        state = self._look()
+        state = self._poll()
         if state is None or state.session != self._orders.session or not self._lives():
             raise DriverError(
                 ENDED,

@@ -21,9 +21,9 @@ from stereoservo.ports.devices import Frame
 PICTURE_LAYOUT = "PreviewPicture.1"
 PICTURE_CAPACITY = 192 << 10
 """Largest size [bytes], below the largest message of a zenoh session (`client.session.MAX_MESSAGE_BYTES`)."""
-WANTED_LAYOUT = "PreviewWanted.1"
-WANTED_BYTES = 8
-WANTED_S = 1.0
+REQUEST_LAYOUT = "PreviewWanted.1"
+REQUEST_BYTES = 8
+REQUEST_S = 1.0
 """Validity of a request [s]; the gateway renews it while there are subscribers."""
 WIDEST_PX = 640
 EVERY_NS = 60_000_000
@@ -71,7 +71,7 @@ class PreviewEncoder:
     """
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
-        self._wanted = SlotReader(directories.preview_request_slot(camera), WANTED_LAYOUT)
+        self._request = SlotReader(directories.preview_request_slot(camera), REQUEST_LAYOUT)
         self._slot = SlotWriter(directories.preview_slot(camera), PICTURE_CAPACITY, PICTURE_LAYOUT)
         self._camera = camera
         self._until_ns = 0
@@ -83,8 +83,8 @@ class PreviewEncoder:
 
     def offer(self, frame: Frame, now_ns: int) -> None:
         """Pass a copy of ``frame`` to the encoder if one is requested and the last one is old enough; never waits."""
-        request = self._wanted.poll()
-        if request is not None and len(request) == WANTED_BYTES:
+        request = self._request.poll()
+        if request is not None and len(request) == REQUEST_BYTES:
             (self._until_ns,) = struct.unpack("=q", request)
         if now_ns > self._until_ns or now_ns - self._last_ns < EVERY_NS:
             return
@@ -128,7 +128,7 @@ class PreviewEncoder:
             self._thread.join(1.0)
             if self._thread.is_alive():
                 return  # it still writes: both slots are released when the process ends
-        self._wanted.close()
+        self._request.close()
         self._slot.close()
 
 
@@ -136,22 +136,22 @@ class PreviewRequest:
     """The gateway's side of one camera's preview: requests images, and reads the newest."""
 
     def __init__(self, directories: CellDirectories, camera: str) -> None:
-        self._wanted = SlotWriter(directories.preview_request_slot(camera), WANTED_BYTES, WANTED_LAYOUT)
+        self._request = SlotWriter(directories.preview_request_slot(camera), REQUEST_BYTES, REQUEST_LAYOUT)
         self._slot = SlotReader(directories.preview_slot(camera), PICTURE_LAYOUT)
 
     def ask(self) -> None:
-        """Request images for the next `WANTED_S` seconds."""
-        self._wanted.write(struct.pack("=q", time.monotonic_ns() + int(WANTED_S * 1e9)))
+        """Request images for the next `REQUEST_S` seconds."""
+        self._request.write(struct.pack("=q", time.monotonic_ns() + int(REQUEST_S * 1e9)))
 
     def poll(self) -> PreviewPicture | None:
-        """The newest image, unless returned before or older than `WANTED_S`. Raises the decoder's exceptions."""
+        """The newest image, unless returned before or older than `REQUEST_S`. Raises the decoder's exceptions."""
         data = self._slot.poll()
         if data is None:
             return None
         picture = picture_decoder.decode(data)
-        return picture if time.monotonic_ns() - picture.t_shutter_ns < int(WANTED_S * 1e9) else None
+        return picture if time.monotonic_ns() - picture.t_shutter_ns < int(REQUEST_S * 1e9) else None
 
     def close(self) -> None:
         """Release both slots. Idempotent."""
-        self._wanted.close()
+        self._request.close()
         self._slot.close()

@@ -23,7 +23,7 @@ from stereoservo.daemon.ipc_messages import PlanError, RunPlan, ServoState, load
 from stereoservo.daemon.kernel_compilation import (
     KernelLoader,
     kernels_to_come,
-    tell_progress,
+    report_progress,
     wait_until_compiled,
     warm_up,
     warm_up_first,
@@ -399,7 +399,7 @@ def main() -> int:
     runtime, parent = Path(sys.argv[1]), int(sys.argv[2])
     die_with_parent(parent, signal.SIGTERM)
     termination = Termination()
-    tell_progress(runtime, "servo", parent)  # of the kernels that this process compiles itself, if no cache is writable
+    report_progress(runtime, "servo", parent)  # of the kernels that this process compiles if no cache is writable
     try:
         run(load_plan(runtime), termination)
     except DriverError as error:

@@ -46,7 +46,7 @@ from stereoservo.daemon.ipc_messages import (
     save_plan,
 )
 from stereoservo.daemon.plant_driver import PLANT_CAPACITY, PLANT_ORDERS_LAYOUT, PLANT_STATE_LAYOUT
-from stereoservo.daemon.preview import PICTURE_CAPACITY, PICTURE_LAYOUT, WANTED_BYTES, WANTED_LAYOUT
+from stereoservo.daemon.preview import PICTURE_CAPACITY, PICTURE_LAYOUT, REQUEST_BYTES, REQUEST_LAYOUT
 from stereoservo.daemon.process_control import Termination, child_environment, write_log
 from stereoservo.daemon.seqlock import create_slot, create_stop_slot, repair_stop_slot
 from stereoservo.messages.cell_file import load_cell_file
@@ -59,7 +59,7 @@ from stereoservo.ports.clock import MonotonicClock
 
 READY_TIMEOUT_S = 300.0
 """Time limit for the processes to be ready after the last compilation of a kernel for them [s]."""
-TELL_EVERY_S = 10.0
+REPORT_EVERY_S = 10.0
 """Interval of progress lines in the log while kernels are compiled [s]."""
 SERVO_END_S = 6.0
 OTHERS_END_S = 4.0
@@ -113,7 +113,7 @@ class Compilation:
         self._process: subprocess.Popen[bytes] | None = None
         self._due: float | None = 0.0
 
-    def look(self, now: float) -> str:
+    def check(self, now: float) -> str:
         """Start it if it is due; returns how it failed, once, else ''."""
         if self._process is None:
             if self._due is not None and now >= self._due:
@@ -171,7 +171,7 @@ class Supervisor:
             with closing(HeartbeatWriter(self.plan.directories.heartbeat_slot("supervisor"))) as heartbeat:
                 while not termination.asked:
                     heartbeat.beat(SUPERVISOR_HANG_S)
-                    self.look(time.monotonic())
+                    self.check(time.monotonic())
                     time.sleep(WATCH_EVERY_S)
         except ServoDiedError as error:
             # Before the gateway ends, which reports it.
@@ -196,7 +196,7 @@ class Supervisor:
                 )
             time.sleep(0.02)
 
-    def look(self, now: float) -> None:
+    def check(self, now: float) -> None:
         """Start the processes that are due, and handle those that have ended or hang. Raises ServoDiedError."""
         late = now - self._looked_s > LATE_S
         self._looked_s = now
@@ -207,7 +207,7 @@ class Supervisor:
                         self._reporter.report("warning", text)
                     _start(child)
                 continue
-            hung = child.watch.look(now, late=late)
+            hung = child.watch.check(now, late=late)
             if hung and not child.hung:
                 child.hung = f"hung: {hung}; it was killed"
                 child.process.kill()
@@ -216,7 +216,7 @@ class Supervisor:
             code = child.process.poll()
             if code is not None:
                 self._ended(child, child.hung or _how(code), now)
-        if self.compilation is not None and (how := self.compilation.look(now)):
+        if self.compilation is not None and (how := self.compilation.check(now)):
             self._reporter.report("process_ended", f"the compilation of kernels {how}")
         self._reporter.flush()
 
@@ -284,14 +284,14 @@ class ProgressLines:
     """Log lines on the number of compiled kernels."""
 
     def __init__(self) -> None:
-        self._due_s = time.monotonic() + TELL_EVERY_S
+        self._due_s = time.monotonic() + REPORT_EVERY_S
         self._said = ""
 
-    def look(self, runtime: Path) -> None:
+    def check(self, runtime: Path) -> None:
         """Log the progress, if it is time and there is progress."""
         if time.monotonic() < self._due_s:
             return
-        self._due_s = time.monotonic() + TELL_EVERY_S
+        self._due_s = time.monotonic() + REPORT_EVERY_S
         words = ", ".join(f"{one.part}: {one.text}" for one in read_progress(runtime))
         if words != self._said:
             self._said = words
@@ -326,7 +326,7 @@ def prepare(
                 process.kill()
                 process.wait()
                 return None
-            progress.look(directories.runtime)
+            progress.check(directories.runtime)
             time.sleep(0.02)
         errors.seek(0)
         text = errors.read().decode(errors="replace").strip()
@@ -356,7 +356,7 @@ def _slots(plan: RunPlan) -> list[tuple[Path, int, str]]:
         found.append((directories.observation_slot(camera.name), OBSERVATION_CAPACITY, OBSERVATION_LAYOUT))
         found.append((directories.prior_slot(camera.name), PRIOR_CAPACITY, PRIOR_LAYOUT))
         found.append((directories.preview_slot(camera.name), PICTURE_CAPACITY, PICTURE_LAYOUT))
-        found.append((directories.preview_request_slot(camera.name), WANTED_BYTES, WANTED_LAYOUT))
+        found.append((directories.preview_request_slot(camera.name), REQUEST_BYTES, REQUEST_LAYOUT))
     return found
 
 
@@ -428,7 +428,7 @@ def run_cell(
         record_run(partial(begin_run, directories, options.boot, os.getpid()))
         compilation = Compilation(directories.runtime)
         try:
-            compilation.look(0.0)  # during the preparation and, niced, during operation
+            compilation.check(0.0)  # during the preparation and, niced, during operation
             plan = prepare(cell_path.absolute(), options, directories, termination)
             if plan is not None:
                 write_log("run", f"cell {cell.cell.name!r} starts; runtime directory {directories.runtime}")

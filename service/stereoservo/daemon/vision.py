@@ -65,7 +65,7 @@ SILENT_CAMERA_S = 2.0
 """Time without data after which a camera is closed and reopened [s]."""
 QUIET_PERIODS = 0.6
 """Fraction of a camera's period after a frame without polling: an earlier frame is received a little later."""
-LOOKS = 2
+POLLS = 2
 """Number of unsuccessful polls per frame above which polling for the next frame starts later."""
 PRIOR_MAX_AGE_S = 0.5
 EXIT_SETUP = 3
@@ -189,26 +189,26 @@ class CameraPipeline:
 
 class Quiet:
     """Adaptive pause in the polling of a camera after a frame. It starts at ``QUIET_PERIODS`` of the camera's period
-    and grows until a frame arrives after ``LOOKS`` unsuccessful polls; it is shortened at once if a frame may have
+    and grows until a frame arrives after ``POLLS`` unsuccessful polls; it is shortened at once if a frame may have
     waited. ``period_s`` 0: no pause.
     """
 
     def __init__(self, period_s: float, poll_s: float) -> None:
         self._least_s, self._most_s, self._poll_s = QUIET_PERIODS * period_s, period_s, poll_s
-        self._looks = 0
+        self._polls = 0
         self._s = self._least_s
 
-    def look_in_vain(self) -> None:
+    def unsuccessful_poll(self) -> None:
         """Count a poll without a frame."""
-        self._looks += 1
+        self._polls += 1
 
     def after_frame(self) -> float:
         """Pause after a poll that returned a frame [s]."""
-        if self._looks == 0:
-            self._s = max(self._s - LOOKS * self._poll_s, self._least_s)
-        elif self._looks > LOOKS:
+        if self._polls == 0:
+            self._s = max(self._s - POLLS * self._poll_s, self._least_s)
+        elif self._polls > POLLS:
             self._s = min(self._s + 0.5 * self._poll_s, self._most_s)
-        self._looks = 0
+        self._polls = 0
         return self._s
 
 
@@ -254,7 +254,7 @@ def camera_loop(
                 elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
                     raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)
                 else:
-                    quiet.look_in_vain()
+                    quiet.unsuccessful_poll()
                     yield poll_s
         except DriverError as error:
             if not down:

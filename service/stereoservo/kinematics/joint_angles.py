@@ -46,7 +46,7 @@ MAX_SIGMA_FACTOR = 3.0
 """Residual [stated sigmas, rms] above which the pixels do not belong to this chain and these points."""
 EXACT = 1e-4
 """Cost at which equations without redundancy count as solved."""
-MISFIT_TAIL = 1e-6
+RESIDUAL_TAIL = 1e-6
 """Probability below which a cost is not explained by noise."""
 LARGEST_DEVIATION = 0.1
 """Standard deviation [rad or m] above which a joint counts as not observable."""
@@ -164,7 +164,7 @@ def _behind() -> JointAnglesError:
 def _outside(q: FloatArray, bounds: FloatArray) -> JointAnglesError:
     return JointAnglesError(
         "outside_limits",
-        f"the pixels say {np.round(q, 4).tolist()}, outside of the limits {bounds.tolist()}",
+        f"the pixels give {np.round(q, 4).tolist()}, outside of the limits {bounds.tolist()}",
         q=q.tolist(),
         limits=bounds.tolist(),
     )
@@ -178,7 +178,7 @@ def _possible(problem: JointProblem, costs: FloatArray) -> npt.NDArray[np.int64]
     freedom = max(0, problem.freedom)
     factor = max(1.0, best / max(1, freedom))
     # As many equations as joints are solved exactly or not at all.
-    chance = 2.0 * float(gammainccinv(0.5 * freedom, MISFIT_TAIL)) if freedom else EXACT  # of chi-square
+    chance = 2.0 * float(gammainccinv(0.5 * freedom, RESIDUAL_TAIL)) if freedom else EXACT  # of chi-square
     if best > MAX_SIGMA_FACTOR**2 * chance:
         raise JointAnglesError(
             "no_agreement",
@@ -464,8 +464,8 @@ def _refuse_undetermined(problem: JointProblem, q: FloatArray, largest: float) -
     if open_joints:
         raise JointAnglesError(
             "not_observable",
-            f"the images do not tell joint(s) {', '.join(open_joints)}: standard deviation above {largest:g}. More "
-            "points, points farther from their axes, or another stop are needed",
+            f"the images do not determine joint(s) {', '.join(open_joints)}: standard deviation above {largest:g}. "
+            "More points, points farther from their axes, or another stop are needed",
             joints=open_joints,
             deviations=[float(d) if d < 1e6 else None for d in deviations],
             maximum=largest,

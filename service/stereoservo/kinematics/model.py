@@ -351,7 +351,7 @@ def _check_cameras(model: CellModel, path: Path | str) -> None:
             raise ModelFileError(
                 path,
                 f"cameras[{i}].lens",
-                f"{camera.name!r}: distortion parameter {strongest:g}; at most {MAX_DISTORTION:g} either way is taken",
+                f"{camera.name!r}: distortion parameter {strongest:g}; at most ±{MAX_DISTORTION:g} is accepted",
             )
         # Rows of unit length: the result is the rank, independent of units.
         rows = np.linalg.norm(camera.matrix, axis=1)
@@ -391,7 +391,7 @@ def _check_scene(model: CellModel, path: Path | str) -> None:
     ids, points, covariances = model.scene_ids, model.scene_points, model.scene_covariances
     for marker in ids:
         if ids.count(marker) > 1:
-            raise ModelFileError(path, "scene_ids", f"{marker} stands twice; entries must differ")
+            raise ModelFileError(path, "scene_ids", f"{marker} occurs twice; entries must differ")
         if marker in model.marker_ids:
             raise ModelFileError(path, "scene_ids", f"{marker} is in marker_ids, too; a static id is not of the arm")
     if ids and model.mount == "eye_in_hand":

@@ -117,7 +117,7 @@ def _call_by_symbol(dispatcher: Any) -> None:
     dispatcher.add_overload = add_overload
 
 
-def tell_compiled(tell: Callable[[int], None]) -> None:
+def report_compiled(tell: Callable[[int], None]) -> None:
     """Register ``tell``, which is called after each compilation of a kernel with the number of signatures that this
     process has compiled or loaded.
     """

@@ -333,7 +333,7 @@ def _metric_start(
     matrices = cameras @ np.linalg.inv(upgrade)
     X = points @ upgrade.T
     X = X[..., :3] / X[..., 3:]
-    there = np.asarray(np.isfinite(X).all(axis=2))
+    finite = np.asarray(np.isfinite(X).all(axis=2))
     poses = np.full((len(X), 4, 4), np.nan)
     poses[reference] = np.eye(4)
     body = X[reference].copy()
@@ -342,13 +342,13 @@ def _metric_start(
         open_stops = np.flatnonzero(~np.isfinite(poses[:, 0, 0]))
         if not len(open_stops):
             break
-        stop = int(open_stops[np.argmax((there[open_stops] & known).sum(axis=1))])
-        common = there[stop] & known
+        stop = int(open_stops[np.argmax((finite[open_stops] & known).sum(axis=1))])
+        common = finite[stop] & known
         try:
             poses[stop] = similarity_from_points(body[common], X[stop, common], scaled=False)
         except GeometryError:
             break  # the remaining ones have too few known points: left out
-        new = there[stop] & ~known
+        new = finite[stop] & ~known
         body[new] = (X[stop, new] - poses[stop, :3, 3]) @ poses[stop, :3, :3]
     # The first camera is K [I | 0] in this frame. The other cameras' pixels are not square yet: the bundle's ties
     # enforce that as far as it explains the images.

@@ -38,7 +38,7 @@ CENTRE_DEVIATION = 0.03
 PAIR_DEVIATION = 1.0
 """Standard deviation of the rotation between two cameras [°] above which it counts as undetermined."""
 OUTSIDE = 0.5
-"""Distance of a principal point from the middle [image sizes] beyond which the model is implausible."""
+"""Distance of a principal point from the centre [image sizes] beyond which the model is implausible."""
 MOST_LEFT_OUT = 0.2
 """Largest share of rejected measurements."""
 MOST_NOISE = 2.0
@@ -312,10 +312,10 @@ def rig_result(fit: RigFit, known: KnownDistance | None) -> RigCalibration:
 
     root = fit.root
     slopes = np.zeros((len(vector(np.zeros(len(root)))), len(root)))
-    for j, spread in enumerate(np.linalg.norm(root, axis=1)):
+    for j, sigma in enumerate(np.linalg.norm(root, axis=1)):
         step = np.zeros(len(root))
-        step[j] = 1e-3 * spread
-        slopes[:, j] = (vector(step) - vector(-step)) / (2e-3 * spread)
+        step[j] = 1e-3 * sigma
+        slopes[:, j] = (vector(step) - vector(-step)) / (2e-3 * sigma)
     half = slopes @ root
     covariance = half @ half.T
     names = [f"{camera.name}.{name}" for camera in fit.views.cameras for name in INTRINSICS]

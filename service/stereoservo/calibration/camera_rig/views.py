@@ -130,21 +130,21 @@ def _require_layout(views: RigViews) -> None:
                 "State the layout (--board with --pitch, or --layout), or use a second camera",
             )
         return
-    spread = np.linalg.svd(views.layout - views.layout.mean(axis=0), compute_uv=False)
-    if not spread[1] > STRAIGHT * spread[0]:
+    singular_values = np.linalg.svd(views.layout - views.layout.mean(axis=0), compute_uv=False)
+    if not singular_values[1] > STRAIGHT * singular_values[0]:
         raise refused(
             "markers_on_a_line",
             "the markers lie on one line: width of the layout, relative to its length",
-            float(spread[1] / spread[0]),
+            float(singular_values[1] / singular_values[0]),
             STRAIGHT,
             "",
             "Use a board, or a body with markers beside that line",
         )
-    if len(spread) > 2 and spread[2] > FLAT * spread[0]:
+    if len(singular_values) > 2 and singular_values[2] > FLAT * singular_values[0]:
         raise refused(
             "layout_not_flat",
             "the stated layout is no plane: its depth, relative to its length",
-            float(spread[2] / spread[0]),
+            float(singular_values[2] / singular_values[0]),
             FLAT,
             "",
             "Leave the layout out, for a body in space is found with the cameras, and state one length (--length)",
@@ -252,9 +252,9 @@ def _mean(
 
 def _elsewhere(place: FloatArray, before: FloatArray) -> bool:
     """Whether the body (c, m, 2) is away from its previous place."""
-    for here, there in zip(place, before, strict=True):
-        common = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
-        if common.any() and float(np.median(np.linalg.norm((here - there)[common], axis=1))) > ELSEWHERE_PX:
+    for first, second in zip(place, before, strict=True):
+        common = np.isfinite(first).all(axis=1) & np.isfinite(second).all(axis=1)
+        if common.any() and float(np.median(np.linalg.norm((first - second)[common], axis=1))) > ELSEWHERE_PX:
             return True
     seen = [np.asarray(np.isfinite(one).all(axis=2)).any(axis=1) for one in (place, before)]
     return bool((seen[0] != seen[1]).any())

@@ -91,7 +91,7 @@ def _angle(D: FloatArray) -> float:
 
 
 class Snapshot(NamedTuple):
-    """Measurements of one moment: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
+    """Measurements of one instant: cameras ``Ps`` (c, 3, 4) and points ``X`` (p, 4), the first ``markers`` of the arm;
     their predicted ``pixels`` and ``observed`` ones (c, p, 2), ``weights`` (c, p) [1/px]; the arm's ``operators``
     (n, 4, 4) and the ``twists`` (6 or 0, 4, 4) of a metric model.
     """
@@ -107,11 +107,11 @@ class Snapshot(NamedTuple):
 
 
 @kernel
-def fit_hypothesis(h: int, rounds: int, moment: Snapshot, sizes: IntArray, result: FloatArray) -> None:
+def fit_hypothesis(h: int, rounds: int, snapshot: Snapshot, sizes: IntArray, result: FloatArray) -> None:
     """Estimate of hypothesis ``h`` into ``result`` (4,): chi-square of the affected measurements, first-order gain,
     amount, effect [px].
     """
-    Ps, X, markers, pixels, observed, weights, operators, twists = moment
+    Ps, X, markers, pixels, observed, weights, operators, twists = snapshot
     cameras, joints = Ps.shape[0], operators.shape[0]
     D, total = np.empty((4, 4)), np.empty(MAX_SIZE)
     seen_points, predicted = ObservedPoints(Ps, X, observed, weights), ObservedPoints(Ps, X, pixels, weights)
@@ -281,7 +281,7 @@ def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, 
     answer[0], answer[1], answer[2] = NOTHING, 0, -1
     chi2[0] = whole
     amounts[0], effects[0] = 0.0, 0.0
-    moment = Snapshot(Ps, X, markers, pixels, observed, weights, operators, twists)
+    snapshot = Snapshot(Ps, X, markers, pixels, observed, weights, operators, twists)
     result = np.zeros(4)
     now, gains = np.zeros(count), np.zeros(count)
     any_gain = False
@@ -290,7 +290,7 @@ def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, 
         gains[h] = -math.inf
         if sizes[h] == 0:
             continue
-        fit_hypothesis(h, 0, moment, sizes, result)
+        fit_hypothesis(h, 0, snapshot, sizes, result)
         now[h] = result[0]
         chi2[h] = whole - result[1]
         gains[h] = result[1] - sizes[h] * penalty
@@ -303,7 +303,7 @@ def explain_innovations(seen: Fields, thresholds: FloatArray, log_alpha: float, 
     select_candidates(gains, sizes, candidates)
     for h in range(1, count):
         if candidates[h]:
-            fit_hypothesis(h, ROUNDS, moment, sizes, result)
+            fit_hypothesis(h, ROUNDS, snapshot, sizes, result)
             chi2[h] = whole - now[h] + result[0]
             amounts[h], effects[h] = result[2], result[3]
     noise = noise_level(chi2, sizes, candidates, total)
@@ -468,7 +468,7 @@ def fit_image_motion(
     ``moved`` (q, 2): the moved pixels. Second: the gain to first order of the first step.
     """
     q = pixels.shape[0]
-    seen, cu, cv, spread = 0.0, 0.0, 0.0, 0.0
+    seen, cu, cv, radius = 0.0, 0.0, 0.0, 0.0
     for p in range(q):
         if weights[p] > 0.0:
             seen += 1.0
@@ -477,13 +477,13 @@ def fit_image_motion(
     cu, cv = cu / max(seen, 1.0), cv / max(seen, 1.0)
     for p in range(q):
         if weights[p] > 0.0:
-            spread += (pixels[p, 0] - cu) ** 2 + (pixels[p, 1] - cv) ** 2
-    spread = math.sqrt(spread / max(seen, 1.0))
-    if spread == 0.0:
-        spread = 1.0
+            radius += (pixels[p, 0] - cu) ** 2 + (pixels[p, 1] - cv) ** 2
+    radius = math.sqrt(radius / max(seen, 1.0))
+    if radius == 0.0:
+        radius = 1.0
     here = np.empty((q, 2))
     for p in range(q):
-        here[p, 0], here[p, 1] = (pixels[p, 0] - cu) / spread, (pixels[p, 1] - cv) / spread
+        here[p, 0], here[p, 1] = (pixels[p, 0] - cu) / radius, (pixels[p, 1] - cv) / radius
     N, b, a, rows = np.empty((size, size)), np.empty(size), np.empty(size), np.zeros((2, size))
     best, linear = math.inf, 0.0
     for turn in range(rounds + 1):
@@ -491,12 +491,12 @@ def fit_image_motion(
         b[:] = 0.0
         chi2 = 0.0
         for p in range(q):
-            w = weights[p] * spread
+            w = weights[p] * radius
             if not w > 0.0:
                 continue
             x, y = here[p, 0], here[p, 1]
-            du = (observed[p, 0] - cu) / spread - x
-            dv = (observed[p, 1] - cv) / spread - y
+            du = (observed[p, 0] - cu) / radius - x
+            dv = (observed[p, 1] - cv) / radius - y
             chi2 += w * w * (du * du + dv * dv)
             rows[0, 0] = rows[1, 1] = 1.0
             if size == 8:
@@ -507,7 +507,7 @@ def fit_image_motion(
             break
         best = chi2
         for p in range(q):
-            moved[p, 0], moved[p, 1] = cu + spread * here[p, 0], cv + spread * here[p, 1]
+            moved[p, 0], moved[p, 1] = cu + radius * here[p, 0], cv + radius * here[p, 1]
         gain = _solved(N, b, a)
         if turn == 0:
             linear = gain

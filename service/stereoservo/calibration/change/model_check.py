@@ -280,7 +280,7 @@ def isolated_outliers(problem: LinearisedProblem) -> npt.NDArray[np.bool_]:
     return gross
 
 
-ELSEWHERE = "; the marker body stands elsewhere than at calibration, as [scene] moves says it may"
+ELSEWHERE = "; the marker body has another pose than at calibration, as [scene] moves says it may"
 
 
 def make_check_report(
@@ -389,7 +389,7 @@ def _joint_sentence(model: CellModel, subject: str, value: float | None, deviati
     amount = f"{value:+.5g} m ± {deviation:.2g} m"
     if model.joint_kinds[j] == "revolute" and value is not None and deviation is not None:
         amount = f"{np.degrees(value):+.4g}° ± {np.degrees(deviation):.2g}°"
-    ends = {0: "what the arm stands on", len(model.joint_names) - 1: "what its flange carries"}
+    ends = {0: "what the arm is mounted on", len(model.joint_names) - 1: "what its flange carries"}
     also = f", or {ends[j]} turned about its axis" if j in ends else ""
     return f"zero of joint {subject} drifted by {amount}{also}"
 
@@ -549,8 +549,8 @@ def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> N
     if poor:
         raise CalibrationError(
             "not_observable",
-            f"the check does not tell the zero of {', '.join(poor)}: standard deviation above {LARGEST_DEVIATION:g} "
-            "rad or m. Markers farther from its axis, or another base, are needed",
+            f"the check does not determine the zero of {', '.join(poor)}: standard deviation above "
+            f"{LARGEST_DEVIATION:g} rad or m. Markers farther from its axis, or another base, are needed",
             joints=poor,
         )
     noise = max(1.0, found.chi2 / max(1, 2 * len(problem.data.camera) - found.x.size))
@@ -561,8 +561,8 @@ def _must_be_observable(examined: ModelExamination, deviations: FloatArray) -> N
             if estimate_changes(problem, swapped).chi2 - found.chi2 < DISTINGUISHABLE * noise:
                 raise CalibrationError(
                     "not_observable",
-                    f"the check does not tell a drift of {cause.subject} from one of {other.subject}: at these stops "
-                    "both move the markers alike. Take a base where their axes are different lines, or calibrate again",
+                    f"the check does not distinguish a drift of {cause.subject} from one of {other.subject}: at "
+                    "these stops both move the markers alike. Take a base where their axes differ, or calibrate again",
                     joints=[cause.subject, other.subject],
                 )
 

@@ -81,8 +81,8 @@ def refine_model(
         raise CalibrationError(
             "model_does_not_fit",
             f"not refined: the model does not fit any more: {check.message}. That is what the poses together are most "
-            "like; where the cell changed while they were collected, `calibrate --check` tells what it is. Remove the "
-            "cause, or calibrate again",
+            "like; where the cell changed while they were collected, `calibrate --check` reports what it is. Remove "
+            "the cause, or calibrate again",
             causes=[cause.message for cause in check.causes],
         )
     data = examined.problem.data

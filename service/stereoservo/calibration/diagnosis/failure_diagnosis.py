@@ -59,14 +59,14 @@ PLAIN = frozenset(
 """Codes that already name the cause."""
 STEPS_IMITATE = frozenset({"joint_without_effect", "lens_implausible"})
 """Codes that a step of the pixels imitates: as noise that hides a joint's motion, or by a lens that adapts to it."""
-MISFITS = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
+MISMATCH = frozenset({"joint_kind", "views_degenerate", "no_convergence", "too_many_outliers", "residual_above_floor"})
 """Codes of contradictory data: the misfit may show the cause."""
 LASTING = frozenset({"camera_moved", "marker_slipped", "moved_together", "camera_or_body_moved", "markers_disagree"})
 """Codes of lasting changes during the trials."""
 LENIENT_OUTLIERS, LENIENT_TRIAL_OUTLIERS = 0.6, 0.85
 """Limits of outliers of the lenient fit that is used to explain them."""
 
-APART = 0.1
+MOVED_FRACTION = 0.1
 """Distance of a joint from its median, relative to its range over the trials, from which it counts as displaced."""
 LEAST_TOGETHER = 4
 """Number of stops with several displaced joints that is sufficient to test their combined effect."""
@@ -103,7 +103,7 @@ def diagnose_failure(
         return named
     if error.code == "too_few_stops" and error.data.get("markers_lost", 0):
         return _contradiction_error(trials, error)
-    return _outlier_error(trials, error, refit, options) if error.code in MISFITS else error
+    return _outlier_error(trials, error, refit, options) if error.code in MISMATCH else error
 
 
 def _first_cause(
@@ -174,7 +174,7 @@ def _outlier_error(trials: TrialData, error: CalibrationError, refit: Refit, opt
         )
     return CalibrationError(
         error.code,
-        f"{error.message}. Not told apart: positions reported wrongly or at another time than the images, play, "
+        f"{error.message}. Not distinguished: positions reported wrongly or at another time than the images, play, "
         "a camera or marker that moved more than once, many wrong detections",
         **error.data,
     )
@@ -185,7 +185,7 @@ def _unrelated(trials: TrialData, k: int) -> CalibrationError:
     return CalibrationError(
         "views_unrelated",
         f"cameras {names[0]!r} and {names[1]!r} agree on no epipolar geometry, not even within single trials: they do "
-        "not see the same markers at the same time. Do they look at two arms, are ids mixed up, are images late?",
+        "not see the same markers at the same time. Do they see two arms, are ids mixed up, are images late?",
         cameras=names,
     )
 
@@ -246,7 +246,7 @@ def review_notes(trials: TrialData, result: CalibrationFit, refit: Refit, option
                 first = trials.joint_names[trials.joint_kinds.index("prismatic")]
                 notes.append(
                     f"joint {trials.joint_names[ratio.joint]!r} reports {ratio.factor:.5g} ± {ratio.deviation:.1g} "
-                    f"times what joint {first!r} does for the same way: check the drives' scales. The model absorbs it"
+                    f"times what joint {first!r} does for equal travel: check the drives' scales. The model absorbs it"
                 )
     return tuple(notes)
 
@@ -256,7 +256,7 @@ def untested_properties(trials: TrialData) -> tuple[str, ...]:
     only move one at a time, from one configuration.
     """
     n = len(trials.joint_names)
-    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > APART * np.ptp(
+    displaced = np.abs(trials.positions - np.median(trials.positions, axis=0)) > MOVED_FRACTION * np.ptp(
         trials.positions, axis=0
     )
     together = int(((trials.trials < 0) & (displaced.sum(axis=1) > 1)).sum())

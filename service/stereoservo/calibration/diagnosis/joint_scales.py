@@ -324,9 +324,9 @@ def small_scales(cause: CalibrationError) -> str:
         for name, one in joints.items()
     )
     return (
-        f"joint {listed}: its drive's scale may be wrong, or it gives way under its load, or turns with the joint "
-        "beside it; the trials do not tell which, and the model takes it for an error of the reading. What tells: its "
-        "angle by a protractor over its whole range, the arm's weight on and off it"
+        f"joint {listed}: its drive's scale may be wrong, or it yields under its load, or turns with the joint "
+        "beside it; the trials do not determine which, and the model takes it for an error of the reading. To find "
+        "out: its angle by a protractor over its whole range, the arm's weight on and off it"
     )
 
 

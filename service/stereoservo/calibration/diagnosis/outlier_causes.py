@@ -438,7 +438,7 @@ def _inexact_joints(trials: TrialData, found: VarianceComponents) -> Calibration
     ranges = np.ptp(trials.positions, axis=0)
     listed = ", ".join(
         f"{trials.joint_names[j]!r} by {1e3 * deviations[j]:.2g} {'mrad' if kind == 'revolute' else 'mm'} "
-        f"({deviations[j] / ranges[j]:.0%} of its way)"
+        f"({deviations[j] / ranges[j]:.0%} of its travel)"
         for j, kind in enumerate(trials.joint_kinds)
         if deviations[j] > NOTABLE * float((deviations / ranges).max()) * ranges[j]
     )

@@ -20,9 +20,9 @@ COMPONENTS, UNITS = (TRANSLATION, ROTATION), ("", "rad")
 
 
 @kernel
-def cartesian2_kernel(room: Record) -> None:
+def cartesian2_kernel(workspace: Record) -> None:
     """The law's ``kernel``."""
-    fill_step(room, 2)
+    fill_step(workspace, 2)
 
 
 def cartesian2(scene: Scene, task: Task, options: Options) -> LawStep:

@@ -3,7 +3,7 @@ that aligns the plane of a marker face, turn of the face in its plane. Also the 
 
 The centre moves on a straight line while the face is rotated about it. `cartesian2` uses the same functions; it
 combines hinge and turn into one rotation (8.55). A component that would turn the face out of a camera's view waits for
-the other (`way_in_sight`); a velocity that is held for a time makes exactly the intended motion
+the other (`visible_rotation`); a velocity that is held for a time makes exactly the intended motion
 (`control.step_correction`).
 
 The face's visibility during the motion (thesis 7.4.2): it is rotated by ``t`` about an axis through the centre while
@@ -12,7 +12,7 @@ the centre moves the fraction ``s`` of its straight line. A camera at ``O`` sees
 interval, and a path with monotonic ``s`` and ``t`` exists if the largest lower bound so far never exceeds the upper
 one. This determines how far the translation may go before the rotation has caught up, how far the rotation may go
 before the translation has, and in which of its two directions the rotation is possible at all: the shorter rotation may
-violate visibility; the longer one is then taken.
+violate visibility; the longer one is then used.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ APPROACH = 4.0
 
 
 @kernel
-def _way(
+def _clear_rotation(
     F: FloatArray, G: FloatArray, margins: FloatArray, cameras: int, angle: float, margin: float
 ) -> tuple[float, float, bool]:
     """Allowed fraction of the translation, allowed rotation, and whether the path is clear."""
@@ -102,12 +102,12 @@ def _way(
 
 
 @kernel
-def way_in_sight(
-    face: FloatArray, H: FloatArray, displacement: FloatArray, eyes: FloatArray, side: float, angle: float
+def visible_rotation(
+    face: FloatArray, H: FloatArray, displacement: FloatArray, centres: FloatArray, side: float, angle: float
 ) -> tuple[float, float, float, bool]:
     """Angle, fraction of the translation and rotation that keep a face (4,) in view, and whether a path in view exists.
 
-    ``eyes`` (c, 4): camera centres of height 1.
+    ``centres`` (c, 4): camera centres of height 1.
     ``side``: 1 or -1, the side of the face that is seen.
     """
     rows = np.empty((3, 4))
@@ -119,7 +119,7 @@ def way_in_sight(
             for j in range(4):
                 s += rows[k - 1, j] * H[j, i]
             rows[k, i] = s
-    cameras = eyes.shape[0]
+    cameras = centres.shape[0]
     F = np.empty((cameras, 3))
     margins = np.empty(cameras)
     G = np.zeros(3)
@@ -133,7 +133,7 @@ def way_in_sight(
         for k in range(3):
             s = 0.0
             for i in range(4):
-                s += rows[k, i] * eyes[c, i]
+                s += rows[k, i] * centres[c, i]
             F[seeing, k] = side * s
         now = F[seeing, 0]
         end = now - G[0] - sine * (F[seeing, 1] - G[1]) + versine * (F[seeing, 2] - G[2])
@@ -145,10 +145,10 @@ def way_in_sight(
         sense = angle if trial % 2 == 0 else other
         if trial % 2 == 1 and angle == 0.0:
             continue
-        share, turn, clear = _way(F, G, margins, seeing, sense, 1.0 if trial < 2 else 0.0)
+        share, turn, clear = _clear_rotation(F, G, margins, seeing, sense, 1.0 if trial < 2 else 0.0)
         if clear:
             return sense, share, turn, True
-    share, turn, clear = _way(F, G, margins, seeing, angle, 0.0)
+    share, turn, clear = _clear_rotation(F, G, margins, seeing, angle, 0.0)
     return angle, share, turn, False
 
 
@@ -289,12 +289,12 @@ def cartesian_step(
     visibility = _kept_in_view(freedoms, task, FacePlanes(face, target_face), camera_centres, single, parts)
     steps = _paced(parts, visibility, pace, errors, allowed, shown)
     if singular:
-        wanted = np.zeros((4, 4))
+        required = np.zeros((4, 4))
         for i in range(count):
             for a in range(4):
                 for k in range(4):
-                    wanted[a, k] += steps[i] * parts.generators[i, a, k]
-        velocity = damped_step(operators, V, values, wanted, dt_s if dt_s > 0.0 else 1.0)
+                    required[a, k] += steps[i] * parts.generators[i, a, k]
+        velocity = damped_step(operators, V, values, required, dt_s if dt_s > 0.0 else 1.0)
         if dt_s > 0.0:
             share = _shortened(velocity) / dt_s
             for j in range(n):
@@ -336,24 +336,24 @@ def _exact_into(
     share = _shortened(velocity)
     for j in range(n):
         velocity[j] *= share
-    held, wanted = np.empty((4, 4)), np.empty((4, 4))
+    held, required = np.empty((4, 4)), np.empty((4, 4))
     for k in range(4):
         for i in range(3):
             held[i, k] = points[i, k]
         held[3, k] = centre[k]
     for i in range(4):
         for k in range(4):
-            wanted[i, k] = held[i, k]
+            required[i, k] = held[i, k]
     H, square, cube = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     for back in range(count):
         i = count - 1 - back
         if steps[i] != 0.0:
             exponential_into(parts.generators[i], share * steps[i], square, cube, H)
             for p in range(4):
-                wanted[p, 0], wanted[p, 1], wanted[p, 2], wanted[p, 3] = product(
-                    H, wanted[p, 0], wanted[p, 1], wanted[p, 2], wanted[p, 3]
+                required[p, 0], required[p, 1], required[p, 2], required[p, 3] = product(
+                    H, required[p, 0], required[p, 1], required[p, 2], required[p, 3]
                 )
-    step = corrected_step(operators, composition, held, wanted, velocity)
+    step = corrected_step(operators, composition, held, required, velocity)
     for j in range(n):
         velocity[j] = step[j] / dt_s
 
@@ -390,11 +390,11 @@ class Stepped(NamedTuple):
 
 
 @kernel
-def _normalised_step_into(arm: CurrentArm, task: BodyTask, eyes: FloatArray, rates: Rates, stepped: Stepped) -> None:
+def _normalised_step_into(arm: CurrentArm, task: BodyTask, centres: FloatArray, rates: Rates, stepped: Stepped) -> None:
     """`cartesian_step` in the frame of `normal_frame`, so that no threshold depends on the projective frame; lengths in
     the task error are in the frame of the arguments.
 
-    ``stepped``: receives the result; ``eyes`` (c, 4): camera centres.
+    ``stepped``: receives the result; ``centres`` (c, 4): camera centres.
     """
     operators, composition = arm
     marker_points, target_points, corners, centre, centre_target = task
@@ -406,22 +406,22 @@ def _normalised_step_into(arm: CurrentArm, task: BodyTask, eyes: FloatArray, rat
         for k in range(4):
             points[p, k] = marker_points[corners[p], k]
             targets[p, k] = target_points[corners[p], k]
-    change, back = normal_frame(points, eyes)
+    change, back = normal_frame(points, centres)
     turned, work = np.empty((n, 4, 4)), np.empty((4, 4))
     for j in range(n):
         multiply4_into(change, operators[j], work)
         multiply4_into(work, back, turned[j])
-    centres, inner = np.empty((2, 4)), np.empty((2, 4))
+    ends, inner = np.empty((2, 4)), np.empty((2, 4))
     for k in range(4):
-        centres[0, k], centres[1, k] = centre[k], centre_target[k]
-    transform_points_into(change, centres, inner)
-    before = norm(centres[1] - centres[0])
+        ends[0, k], ends[1, k] = centre[k], centre_target[k]
+    transform_points_into(change, ends, inner)
+    before = norm(ends[1] - ends[0])
     ratio = norm(inner[1] - inner[0]) / before if before > 0.0 else 1.0
     found = cartesian_step(
         turned,
         composition,
         FaceTask(transform_points(change, points), transform_points(change, targets), inner[0], inner[1]),
-        transform_points(change, eyes),
+        transform_points(change, centres),
         Pace(np.full(count, gain), dt_s, rotation_rate, ratio * translation_rate),
         count == 2,
     )
@@ -456,11 +456,11 @@ def _kept_in_view(
     screws, generators, amount, status = parts
     side = 1.0
     if cameras > 0:
-        middle = np.zeros(4)
+        centroid = np.zeros(4)
         for c in range(cameras):
             for k in range(4):
-                middle[k] += camera_centres[c, k] / cameras
-        side = 1.0 if dot(target_face, middle) >= 0.0 else -1.0
+                centroid[k] += camera_centres[c, k] / cameras
+        side = 1.0 if dot(target_face, centroid) >= 0.0 else -1.0
     displacement = np.zeros(4)
     if status[0] == MOVES:
         for k in range(4):
@@ -471,9 +471,9 @@ def _kept_in_view(
     if single:
         screw, V = np.empty(n), np.empty((4, 4))
         whole, found = _one_rotation(freedoms, parts, screw, V)
-        angle, share, turn, clear = way_in_sight(face, V, displacement, camera_centres, side, whole)
+        angle, share, turn, clear = visible_rotation(face, V, displacement, camera_centres, side, whole)
         if not clear and status[1] == MOVES:
-            other = way_in_sight(face, generators[1], displacement, camera_centres, side, amount[1])
+            other = visible_rotation(face, generators[1], displacement, camera_centres, side, amount[1])
             if other[3]:
                 hinge_first = True
                 angle, share, turn, clear = other
@@ -486,7 +486,7 @@ def _kept_in_view(
                     generators[1, i, k] = V[i, k]
     else:
         turned = amount[1] if status[1] == MOVES else 0.0
-        angle, share, turn, clear = way_in_sight(face, generators[1], displacement, camera_centres, side, turned)
+        angle, share, turn, clear = visible_rotation(face, generators[1], displacement, camera_centres, side, turned)
     if angle < 0.0:
         scale_primitive(screws[1], generators[1], -1.0)
     if single or status[1] == MOVES:
@@ -546,16 +546,16 @@ def cartesian3_step(
 
 
 @kernel
-def _normalised_step(arm: Fields, task: Fields, eyes: FloatArray, rates: Fields, stepped: Fields) -> None:
+def _normalised_step(arm: Fields, task: Fields, centres: FloatArray, rates: Fields, stepped: Fields) -> None:
     """`_normalised_step_into` for Python, with the fields of all records."""
-    _normalised_step_into(CurrentArm(*arm), BodyTask(*task), eyes, Rates(*rates), Stepped(*stepped))
+    _normalised_step_into(CurrentArm(*arm), BodyTask(*task), centres, Rates(*rates), Stepped(*stepped))
 
 
 @kernel
-def fill_step(room: Record, count: int) -> None:
+def fill_step(workspace: Record, count: int) -> None:
     """Compute the step of a law with ``count`` components in the record of `control.law.Law.kernel`."""
-    work = room[0]
-    n, m, c = work.joints, work.markers, work.eye_count
+    work = workspace[0]
+    n, m, c = work.joints, work.markers, work.viewing_count
     arm = CurrentArm(work.operators[: 16 * n].reshape((n, 4, 4)), work.composition)
     task = BodyTask(
         work.body[: 4 * m].reshape((m, 4)),
@@ -567,15 +567,15 @@ def fill_step(room: Record, count: int) -> None:
     stepped = Stepped(
         work.velocity[:n], work.components[: 2 * count].reshape((2, count)), work.component_status[:count]
     )
-    eyes = work.eyes[: 4 * c].reshape((c, 4))
-    _normalised_step_into(arm, task, eyes, Rates(work.gain, work.dt_s, math.inf, math.inf), stepped)
+    centres = work.eyes[: 4 * c].reshape((c, 4))
+    _normalised_step_into(arm, task, centres, Rates(work.gain, work.dt_s, math.inf, math.inf), stepped)
     work.conditioning = 1.0
 
 
 @kernel
-def cartesian3_kernel(room: Record) -> None:
+def cartesian3_kernel(workspace: Record) -> None:
     """The law's ``kernel``."""
-    fill_step(room, 3)
+    fill_step(workspace, 3)
 
 
 def velocity_step(scene: Scene, task: Task, options: Options, count: int) -> LawStep:
@@ -612,7 +612,7 @@ def cartesian_reasons(
         elif codes[i] == WAITS and stuck:
             hint = (
                 "translation and turn wait for each other, or a camera would see the face's back: use the law "
-                "trajectory, whose way may bend, or another centre"
+                "trajectory, whose path may bend, or another centre"
             )
             reasons.append(Reason("VISIBILITY_BLOCKED", "hold", component, left, may, in_unit, hint))
         elif codes[i] == WAITS:

@@ -11,7 +11,7 @@ from stereoservo.control.laws.stereo import image_kernel, image_reasons, image_v
 
 
 def image(scene: Scene, task: Task, options: Options) -> LawStep:
-    """``q̇ = gain·J⁺(s* − s)`` over the markers that are seen and wanted, in any number of cameras (8.26)."""
+    """``q̇ = gain·J⁺(s* − s)`` over the markers that are seen and required, in any number of cameras (8.26)."""
     return image_velocity_step(scene, task, options, options.jacobian, standing(task.rates.shape))
 
 

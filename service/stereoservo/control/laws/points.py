@@ -107,9 +107,9 @@ def step_by_points(operators: FloatArray, task: Fields, gains: Fields) -> tuple[
 
 
 @kernel
-def points_kernel(room: Record) -> None:
+def points_kernel(workspace: Record) -> None:
     """The law's ``kernel``."""
-    work = room[0]
+    work = workspace[0]
     n, c, m = work.joints, work.cameras, work.markers
     body = work.body[: 4 * m].reshape((m, 4))
     seen = np.zeros(m)

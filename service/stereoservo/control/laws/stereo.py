@@ -38,7 +38,7 @@ FIXED_DEPTH = int(JacobianChoice.FIXED_DEPTH)
 
 class View(NamedTuple):
     """``matrices`` (c, 3, 4) and ``camera_centres`` (c, 4) of the cameras; of their markers ``pixels``, ``set_points``
-    and the set-points' ``rates`` [px/s], (c, m, 2) each, ``weights`` (c, m) [1/px] and ``wanted`` (c, m).
+    and the set-points' ``rates`` [px/s], (c, m, 2) each, ``weights`` (c, m) [1/px] and ``required`` (c, m).
     """
 
     matrices: FloatArray
@@ -47,7 +47,7 @@ class View(NamedTuple):
     set_points: FloatArray
     rates: FloatArray
     weights: FloatArray
-    wanted: FloatArray
+    required: FloatArray
 
 
 class Body(NamedTuple):
@@ -118,7 +118,7 @@ def image_equations_into(
     operators: FloatArray, view: View, body: Body, gain: float, choice: int, equations: NormalSystem
 ) -> None:
     """Write the normal equations of `image_step`, undamped; of the matrix only the lower triangle."""
-    matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
+    matrices, camera_centres, pixels, set_points, rates, weights, required = view
     points, target_points, target_known = body
     N, b = equations
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
@@ -133,7 +133,7 @@ def image_equations_into(
     for p in range(markers):
         seen = False
         for c in range(cameras):
-            seen = seen or weights[c, p] * wanted[c, p] > 0.0
+            seen = seen or weights[c, p] * required[c, p] > 0.0
         if not seen:
             continue
         kind = choice if target_known[p] > 0.0 else 0
@@ -142,7 +142,7 @@ def image_equations_into(
         if kind in (DESIRED, MEAN):
             velocities_into(operators, target_points[p], then)
         for c in range(cameras):
-            w = weights[c, p] * wanted[c, p]
+            w = weights[c, p] * required[c, p]
             if not w > 0.0:
                 continue
             P = matrices[c]
@@ -158,10 +158,10 @@ def image_equations_into(
                 # On the ray of the current point, at the depth of the target: P maps the centre to zero.
                 M, T = points[p], target_points[p]
                 depth = P[2, 0] * M[0] + P[2, 1] * M[1] + P[2, 2] * M[2] + P[2, 3] * M[3]
-                wanted_depth = P[2, 0] * T[0] + P[2, 1] * T[1] + P[2, 2] * T[2] + P[2, 3] * T[3]
+                goal_depth = P[2, 0] * T[0] + P[2, 1] * T[1] + P[2, 2] * T[2] + P[2, 3] * T[3]
                 for i in range(4):
-                    eye = camera_centres[c, i]
-                    moved[i] = eye + (wanted_depth / depth) * (M[i] - eye)
+                    centre = camera_centres[c, i]
+                    moved[i] = centre + (goal_depth / depth) * (M[i] - centre)
                 velocities_into(operators, moved, now)
                 add_rows(P, moved, now, 1.0, rows)
             else:
@@ -199,9 +199,9 @@ def _image_step(operators: FloatArray, view: Fields, body: Fields, gains: Fields
 
 
 @kernel
-def image_kernel(room: Record) -> None:
+def image_kernel(workspace: Record) -> None:
     """`image_step` for static set-points, as the ``kernel`` of a law."""
-    work = room[0]
+    work = workspace[0]
     n, c, m = work.joints, work.cameras, work.markers
     view = View(
         work.matrices[: 12 * c].reshape((c, 3, 4)),

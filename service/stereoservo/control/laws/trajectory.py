@@ -101,7 +101,7 @@ def _refine(arm: CurrentArm, view: View, points: FloatArray, plan: Pull, held_st
     """
     operators, composition = arm
     held, dt_s, damping = held_step
-    matrices, camera_centres, pixels, set_points, rates, weights, wanted = view
+    matrices, camera_centres, pixels, set_points, rates, weights, required = view
     pull, meant, planned = plan
     n, cameras, markers = operators.shape[0], matrices.shape[0], points.shape[0]
     known = np.zeros(markers)
@@ -109,7 +109,7 @@ def _refine(arm: CurrentArm, view: View, points: FloatArray, plan: Pull, held_st
     goal, _ = project_points(matrices, points)
     for c in range(cameras):
         for p in range(markers):
-            if weights[c, p] * wanted[c, p] > 0.0:
+            if weights[c, p] * required[c, p] > 0.0:
                 for r in range(2):
                     goal[c, p, r] += dt_s * (rates[c, p, r] + held * (set_points[c, p, r] - pixels[c, p, r]))
     found, best = np.empty(n), np.empty(n)
@@ -128,7 +128,7 @@ def _refine(arm: CurrentArm, view: View, points: FloatArray, plan: Pull, held_st
         error = 0.0
         for c in range(cameras):
             for p in range(markers):
-                w = weights[c, p] * wanted[c, p]
+                w = weights[c, p] * required[c, p]
                 if w > 0.0:
                     for r in range(2):
                         error += (w * (goal[c, p, r] - seen[c, p, r])) ** 2
@@ -139,7 +139,7 @@ def _refine(arm: CurrentArm, view: View, points: FloatArray, plan: Pull, held_st
         before = error
         for j in range(n):
             best[j] = found[j]
-        ahead = View(matrices, camera_centres, seen, goal, no_rates, weights, wanted)
+        ahead = View(matrices, camera_centres, seen, goal, no_rates, weights, required)
         image_equations_into(turned, ahead, Body(moved, moved, known), 1.0, 0, NormalSystem(N, b))
         if planned:
             for j in range(n):

@@ -111,7 +111,7 @@ def drop_plan(context: StepContext, reasons: tuple[Reason, ...], message: str) -
     goal = job.goal
     if job.purpose in ("reply", "enqueue"):
         hint = f"{message} while it was planned"
-        told = reasons or (Reason("CANCELLED", "info", goal.id, hint=hint),)
-        context.emit("reply", request=job.request, accepted=False, id=goal.id, message=hint, reasons=told)
+        given = reasons or (Reason("CANCELLED", "info", goal.id, hint=hint),)
+        context.emit("reply", request=job.request, accepted=False, id=goal.id, message=hint, reasons=given)
     elif job.purpose == "queue":
         context.emit("goal_cancelled", id=goal.id, message=message, reasons=reasons)

@@ -21,7 +21,7 @@ from stereoservo.control.faces import (
     Faces,
     find_faces,
     select_faces,
-    spread_in_images,
+    spaced_in_images,
     visibility_along,
 )
 from stereoservo.control.laws.cartesian3 import cartesian3_step
@@ -70,11 +70,11 @@ ARM_CONVERGED = 1e-10
 """Step of an iteration [rad or m] at which it has converged."""
 
 
-def markers_needed(wanted: FloatArray) -> int:
-    """Number of markers of an accepted goal that have to be seen; ``wanted`` (c, m): those that it shows. All of them,
-    if they are fewer than would determine a pose.
+def markers_needed(required: FloatArray) -> int:
+    """Number of markers of an accepted goal that have to be seen; ``required`` (c, m): those that it shows. All of
+    them, if they are fewer than would determine a pose.
     """
-    return min(MIN_MARKERS, int((wanted.max(axis=0) > 0.0).sum()))
+    return min(MIN_MARKERS, int((required.max(axis=0) > 0.0).sum()))
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ def goal_pose(
     known: BoolArray,
     face: IntArray,
     set_points: FloatArray,
-    wanted: FloatArray,
+    required: FloatArray,
 ) -> GoalPose:
     """Fit one rigid displacement of ``points`` (m, 4) to the set-points.
 
@@ -163,10 +163,10 @@ def goal_pose(
     ``operators`` (n, 4, 4): the arm's current ones, a basis of displacements if the model has no metric one.
     """
     displacement, _ = displacement_by_law(
-        arrays, operators, points, targets, known, face, set_points, wanted, np.eye(4), LAW_STEPS
+        arrays, operators, points, targets, known, face, set_points, required, np.eye(4), LAW_STEPS
     )
     basis = displacement_basis(arrays, operators)
-    return refined_pose(arrays, basis, points, displacement, set_points, wanted)[0]
+    return refined_pose(arrays, basis, points, displacement, set_points, required)[0]
 
 
 def displacement_basis(arrays: ModelArrays, operators: FloatArray) -> FloatArray:
@@ -182,7 +182,7 @@ def displacement_by_law(
     known: BoolArray,
     face: IntArray,
     set_points: FloatArray,
-    wanted: FloatArray,
+    required: FloatArray,
     displacement: FloatArray,
     steps: int,
 ) -> tuple[FloatArray, bool]:
@@ -192,7 +192,7 @@ def displacement_by_law(
     basis = displacement_basis(arrays, operators)
     few = np.flatnonzero(known)
     if len(few) > MOST_TRIED:  # only an initial value for least squares: a part of a large body is enough
-        few = np.union1d(face, spread_in_images(few, set_points, wanted))
+        few = np.union1d(face, spaced_in_images(few, set_points, required))
         face, some = np.searchsorted(few, face), np.ones(len(few), dtype=bool)
         D, near = _displacement_by_law(basis, points[few], (targets[few], some), face, displacement, steps)
     else:
@@ -206,18 +206,18 @@ def refined_pose(
     points: FloatArray,
     displacement: FloatArray,
     set_points: FloatArray,
-    wanted: FloatArray,
+    required: FloatArray,
     refinements: int = REFINEMENTS,
 ) -> tuple[GoalPose, bool]:
     """Least squares on all set-points from a nearby ``displacement`` (4, 4), and whether it has converged in so many
     ``refinements``; ``basis`` (k, 4, 4) of displacements.
     """
     D, moved, pixels, converged = _refine(
-        basis, arrays.matrices, points, displacement, (set_points, wanted), refinements
+        basis, arrays.matrices, points, displacement, (set_points, required), refinements
     )
-    distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
+    distance = np.where(required > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
     worst = int(distance.max(axis=0).argmax())
-    rms_px = float(np.sqrt((distance * distance).sum() / max(float(wanted.sum()), 1.0)))
+    rms_px = float(np.sqrt((distance * distance).sum() / max(float(required.sum()), 1.0)))
     return GoalPose(moved, D, rms_px, float(distance.max()), arrays.marker_ids[worst]), bool(converged)
 
 
@@ -225,7 +225,7 @@ def refined_pose(
 def _displacement_by_law(
     basis: FloatArray,
     points: FloatArray,
-    there: tuple[FloatArray, BoolArray],
+    goal: tuple[FloatArray, BoolArray],
     face: IntArray,
     displacement: FloatArray,
     steps: int,
@@ -233,19 +233,19 @@ def _displacement_by_law(
     """Displacement (4, 4) to which the Cartesian law converges: the face of ``points`` (m, 4) onto that of the targets.
     Returns it after so many ``steps`` from a ``displacement``, and whether it is close to the solution.
 
-    ``there``: the targets (m, 4), and which of them are known (m,).
+    ``goal``: the targets (m, 4), and which of them are known (m,).
     """
-    targets, known = there
+    targets, known = goal
     nobody = np.zeros((0, 4))  # in this computation no camera has to see the face
     gains = np.full(3, LAW_GAIN)
     D = displacement.copy()
     moved = transform_points(D, points)
-    centre_target = _middle(targets, known)
+    centre_target = _centroid(targets, known)
     for _ in range(steps):
         twist, _, _, _ = cartesian3_step(
-            basis, FaceTask(moved[face], targets[face], _middle(moved, known), centre_target), nobody, gains
+            basis, FaceTask(moved[face], targets[face], _centroid(moved, known), centre_target), nobody, gains
         )
-        D = _onwards(basis, twist, D)
+        D = _moved_by(basis, twist, D)
         moved = transform_points(D, points)
         if _all_below(twist, NEAR):
             return D, True
@@ -260,22 +260,22 @@ def left_by_components(
     """
     known = np.ones(len(points), dtype=bool)
     D, _ = _displacement_by_law(operators, points, (targets, known), face, np.eye(4), LAW_STEPS)
-    there, _ = project_points(arrays.matrices, transform_points(D, points))
-    wanted, _ = project_points(arrays.matrices, targets)
-    return float(np.sqrt(((there - wanted) ** 2).sum(axis=-1)).max())
+    pixels, _ = project_points(arrays.matrices, transform_points(D, points))
+    goal_pixels, _ = project_points(arrays.matrices, targets)
+    return float(np.sqrt(((pixels - goal_pixels) ** 2).sum(axis=-1)).max())
 
 
 @kernel
-def _middle(points: FloatArray, known: BoolArray) -> FloatArray:
+def _centroid(points: FloatArray, known: BoolArray) -> FloatArray:
     """Mean (4,) of the ``known`` ones of ``points`` (m, 4)."""
-    middle = np.zeros(4)
+    centroid = np.zeros(4)
     count = 0.0
     for p in range(points.shape[0]):
         if known[p]:
             count += 1.0
             for i in range(4):
-                middle[i] += points[p, i]
-    return middle / count
+                centroid[i] += points[p, i]
+    return centroid / count
 
 
 @kernel
@@ -288,18 +288,18 @@ def _refine(
     refinements: int,
 ) -> tuple[FloatArray, FloatArray, FloatArray, bool]:
     """Least squares of `refined_pose`: displacement (4, 4), displaced points (m, 4), their pixels (c, m, 2), whether it
-    has converged. ``goal``: set-points (c, m, 2), and which are wanted (c, m).
+    has converged. ``goal``: set-points (c, m, 2), and which are required (c, m).
     """
-    set_points, wanted = goal
+    set_points, required = goal
     D = displacement
     moved = transform_points(D, points)
     converged = False
-    weights = np.repeat(wanted.copy().reshape(-1), 2)
+    weights = np.repeat(required.copy().reshape(-1), 2)
     for _ in range(refinements):
         pixels, _ = project_points(matrices, moved)
         jacobian = image_jacobian(basis, matrices, moved).reshape(-1, basis.shape[0])
         step, _ = damped_least_squares(jacobian, (set_points - pixels).reshape(-1), weights, REFINE_DAMPING)
-        D = _onwards(basis, step, D)
+        D = _moved_by(basis, step, D)
         moved = transform_points(D, points)
         converged = _all_below(step, CONVERGED)
         if converged:
@@ -308,15 +308,15 @@ def _refine(
 
 
 @kernel
-def _onwards(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
+def _moved_by(basis: FloatArray, twist: FloatArray, D: FloatArray) -> FloatArray:
     """``exp(Σ t_j Ĝ_j) D`` (4, 4) for a ``twist`` (k,) in the ``basis`` (k, 4, 4)."""
-    G, onwards = np.zeros((4, 4)), np.empty((4, 4))
+    G, product = np.zeros((4, 4)), np.empty((4, 4))
     for j in range(basis.shape[0]):
         for i in range(4):
             for k in range(4):
                 G[i, k] += twist[j] * basis[j, i, k]
-    multiply4_into(exp_twist(G), D, onwards)
-    return onwards
+    multiply4_into(exp_twist(G), D, product)
+    return product
 
 
 @kernel
@@ -368,13 +368,13 @@ class ReachedPose:
     marker: int
 
 
-def reached_pose(arrays: ModelArrays, joints: FloatArray, set_points: FloatArray, wanted: FloatArray) -> ReachedPose:
-    """Least squares of set-points (c, m, 2) that are ``wanted`` (c, m) in the arm's own joints, from ``joints`` (n,).
+def reached_pose(arrays: ModelArrays, joints: FloatArray, set_points: FloatArray, required: FloatArray) -> ReachedPose:
+    """Least squares of set-points (c, m, 2) that are ``required`` (c, m) in the arm's own joints, from ``joints`` (n,).
 
     Degrees of freedom that the set-points do not determine are not moved.
     """
     q = joints.copy()
-    weights = np.repeat(wanted.reshape(-1), 2)
+    weights = np.repeat(required.reshape(-1), 2)
     for _ in range(ARM_ROUNDS):
         _, operators = chain_at(arrays, q)
         points = markers_at(arrays, q)
@@ -389,7 +389,7 @@ def reached_pose(arrays: ModelArrays, joints: FloatArray, set_points: FloatArray
             break
     points = markers_at(arrays, q)
     pixels, _ = project_points(arrays.matrices, points)
-    distance = np.where(wanted > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
+    distance = np.where(required > 0.0, np.sqrt(((pixels - set_points) ** 2).sum(axis=-1)), 0.0)
     camera, marker = divmod(int(distance.argmax()), distance.shape[1])
     return ReachedPose(q, points, pixels, float(distance.max()), camera, marker)
 
@@ -420,10 +420,10 @@ def enough_in_view(place: BodyState, pixels: FloatArray, shown: FloatArray, know
 
 def keeps_its_shape(body: FloatArray, targets: FloatArray, known: BoolArray) -> None:
     """Raises RefusalError for points or matrices that stretch or shear the body, along the cameras' rays too."""
-    middle = body.sum(axis=0) / len(body)
-    extent = float(np.sqrt(((body - middle) ** 2).sum(axis=-1).max()))
-    apart = np.where(known, np.sqrt(((body - targets) ** 2).sum(axis=-1)), 0.0)
-    share = float(apart.max()) / extent
+    centroid = body.sum(axis=0) / len(body)
+    extent = float(np.sqrt(((body - centroid) ** 2).sum(axis=-1).max()))
+    distances = np.where(known, np.sqrt(((body - targets) ** 2).sum(axis=-1)), 0.0)
+    share = float(distances.max()) / extent
     if not share <= RIGID_SHARE:
         raise RefusalError(
             "NOT_RIGID",
@@ -444,10 +444,10 @@ def turned_to(place: BodyState, displacement: FloatArray) -> FloatArray:
     if not bool((faces.sided > 0.0).any()):
         return found
     fronts = visibility_along(faces, place.points, displacement[None], place.arrays.camera_centres).fronts[0]
-    told = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
+    sided = faces.members[faces.sided > 0.0].max(axis=0) > 0.0
     for c in range(len(found)):
         turned = (faces.members * fronts[:, c : c + 1]).max(axis=0) > 0.0
-        found[c] = np.where(told & ~turned, 0.0, 1.0)
+        found[c] = np.where(sided & ~turned, 0.0, 1.0)
     return found
 
 

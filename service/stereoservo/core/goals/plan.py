@@ -134,7 +134,7 @@ def _posture(named: dict[str, float], joints: FloatArray, context: StepContext) 
     return posture
 
 
-def go_on_planning(job: PlanJob) -> bool:
+def plan_slice(job: PlanJob) -> bool:
     """Do one step's share of planning a path; returns whether planning is complete. For a large body it is complete one
     step later, and reported then.
     """
@@ -181,9 +181,9 @@ def plan_report(job: PlanJob, context: StepContext) -> PlanReport:
         return report
     hint, planned = "", LAWS.on_path("planned")
     if path != "planned" and planned and not (at_goal and approaches[0].code == "NOT_REACHABLE"):
-        hint = f"; law {planned[0]!r} looks for another way, and for another posture at the goal"
+        hint = f"; law {planned[0]!r} searches for another path, and for another posture at the goal"
     elif not at_goal:
-        hint = "; no other way was found either: go by another goal between"
+        hint = "; no other path was found either: go by another goal between"
     reasons = tuple(
         Reason(a.code, "info", a.subject, a.value, a.limit, a.unit, text + (hint if k == 0 else ""))
         for k, (a, text) in enumerate(zip(approaches, texts, strict=True))
@@ -226,7 +226,7 @@ def _require_components(job: PlanJob, context: StepContext) -> None:
 def planning_reason(job: PlanJob) -> Reason:
     """Reason: a goal is being planned."""
     done = 0 if job.planning is None else job.planning.followed
-    hint = f"goal {job.goal.id} is being planned ({done} ways tried); cancel it, hold or stop at any time"
+    hint = f"goal {job.goal.id} is being planned ({done} paths tried); cancel it, hold or stop at any time"
     return Reason("PLANNING", "info", job.goal.id, float(done), None, "ways", hint)
 
 
@@ -238,15 +238,15 @@ def _planned(job: PlanJob, plan: Plan, context: StepContext) -> PlanReport:
     count = min(reported_samples(arrays), len(plan.times))
     at = [round(k * (len(plan.times) - 1) / max(count - 1, 1)) for k in range(count)]
     seconds = float(plan.times[-1])
-    way = plan.description
+    description = plan.description
     path = context.derived.laws[source.law].path
     if path != "planned":
         seconds = max(seconds, _exponential_s(job, context))
         if path == "free":
-            way = f"not guaranteed: law {source.law!r} goes its own way; the straight one is free"
+            description = f"not guaranteed: law {source.law!r} follows its own path; the straight one is free"
     return PlanReport(
         law=source.law,
-        way=way,
+        way=description,
         seconds=seconds,
         approaches=tuple(_approach(approach, job, context) for approach in plan.approaches),
         shares=tuple(float(plan.path_parameters[k]) for k in at),
@@ -309,7 +309,7 @@ def _approach(approach: ClosestApproach, job: PlanJob, context: StepContext) -> 
 
 def _text(failure: goals.Approach, context: StepContext, asked_posture: bool) -> str:
     """Text: where a path fails, and why."""
-    where = "at the goal" if failure.share >= 1.0 else f"at {100.0 * failure.share:.0f} % of the way"
+    where = "at the goal" if failure.share >= 1.0 else f"at {100.0 * failure.share:.0f} % of the path"
     value, limit, unit = f"{failure.value:.4g}", f"{failure.limit:.4g}", failure.unit
     if failure.code == "JOINT_LIMIT":
         return f"{where} joint {failure.subject} would be at {value} {unit}, {limit} {unit} is its limit"
@@ -376,7 +376,7 @@ def prepare(
         goal=goal,
         resolution=begin_resolution(body, context.q + context.state.block.correction, law.needs_goal_pose),
     )
-    if body.arrays.sights <= AT_ONCE:
+    if body.arrays.observation_count <= AT_ONCE:
         set_up(job, context)
     if job.source is None or (job.planning is not None):
         return job
@@ -390,7 +390,7 @@ def _require_plan(goal: Goal, context: StepContext) -> None:
     if isinstance(goal.target, JointTarget | IncidenceTarget):
         said = f"a goal in {'joints' if isinstance(goal.target, JointTarget) else 'incidences'} has none of choice"
     elif not law.planned:
-        said = f"law {name!r} follows no plan, and ends in the posture that its way leads to"
+        said = f"law {name!r} follows no plan, and ends in the posture that its path leads to"
     else:
         return
     raise RefusalError(
@@ -404,20 +404,20 @@ def set_up(job: PlanJob, context: StepContext) -> bool:
     """
     while not _set_up_part(job, context):
         assert context.arrays is not None
-        if context.arrays.sights > AT_ONCE:
+        if context.arrays.observation_count > AT_ONCE:
             return False
     return True
 
 
 def _set_up_part(job: PlanJob, context: StepContext) -> bool:
-    aim, arrays = job.resolution, context.arrays
+    resolved, arrays = job.resolution, context.arrays
     assert arrays is not None
-    if aim is not None and job.source is None:
-        place = BodyState(context.settings, arrays, aim.start, aim.operators, aim.faces)
+    if resolved is not None and job.source is None:
+        place = BodyState(context.settings, arrays, resolved.start, resolved.operators, resolved.faces)
         target = job.goal.target
         assert isinstance(target, Resolvable)
-        if resolve_part(aim, target, place):
-            job.source, job.resolution = start_servoing(job.goal, aim, context), None
+        if resolve_part(resolved, target, place):
+            job.source, job.resolution = start_servoing(job.goal, resolved, context), None
             return job.purpose == "enqueue" or not job.source.pose_known
     elif job.planning is None:
         begin_plan(job, context)

@@ -24,7 +24,7 @@ Pixels = dict[int, tuple[tuple[float, float], ...]]
 
 def reported_samples(arrays: ModelArrays | None) -> int:
     """Number of samples of a path in a report: at least its ends."""
-    pixels = 1 if arrays is None else arrays.sights
+    pixels = 1 if arrays is None else arrays.observation_count
     return max(2, min(REPORTED, REPORTED_PIXELS // pixels))
 
 
@@ -33,10 +33,10 @@ def reported_pixels(arrays: ModelArrays, displacements: FloatArray, points: Floa
 
     Markers that a lens does not image at all of them are left out.
     """
-    pixels = max(len(displacements), 2) * arrays.sights  # a path to the current pose has one sample
+    pixels = max(len(displacements), 2) * arrays.observation_count  # a path to the current pose has one sample
     every = 1 if pixels <= REPORTED_PIXELS else math.ceil(pixels / REPORTED_OF_LARGE)
-    told = np.ascontiguousarray(points[::every])
-    paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, told)
+    chosen = np.ascontiguousarray(points[::every])
+    paths = _raw_paths(arrays.matrices, arrays.lenses, displacements, chosen)
     imaged: list[list[bool]] = np.asarray(np.isfinite(paths).all(axis=(0, 3))).tolist()
     by_camera: list[list[list[Any]]] = paths.transpose(1, 2, 0, 3).tolist()
     return [

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stereoservo.control.faces import spread_in_images
+from stereoservo.control.faces import spaced_in_images
 from stereoservo.core.context import RefusalError
 from stereoservo.core.goals.marker_body import (
     LAW_STEPS,
@@ -67,13 +67,13 @@ FINITE_HEIGHT = 1e-9
 """Height ``|a∞ᵀM|`` relative to ``|a∞||M|`` below which a point is at infinity."""
 
 
-def aim_at(target: Resolvable, place: BodyState, needs_pose: bool, epoch: int) -> GoalResolution:
+def resolve(target: Resolvable, place: BodyState, needs_pose: bool, epoch: int) -> GoalResolution:
     """The resolution of ``target``. ``needs_pose``: of the law; ``epoch``: of the model in use. Raises RefusalError."""
     of_this_model(target.model_epoch, epoch)
-    aim = begin_resolution(place, np.zeros(0), needs_pose)
-    while not resolve_part(aim, target, place):
+    goal = begin_resolution(place, np.zeros(0), needs_pose)
+    while not resolve_part(goal, target, place):
         pass
-    return aim
+    return goal
 
 
 def begin_resolution(place: BodyState, joints: FloatArray, needs_pose: bool) -> GoalResolution:
@@ -85,13 +85,13 @@ def begin_resolution(place: BodyState, joints: FloatArray, needs_pose: bool) -> 
     )  # fmt: skip
 
 
-def resolve_part(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+def resolve_part(goal: GoalResolution, target: Resolvable, place: BodyState) -> bool:
     """Do the next part of the resolution; returns whether it was the last. Raises RefusalError if the target is
     impossible.
     """
-    if _PARTS[aim.part](aim, target, place):
-        aim.part += 1
-    return aim.part == len(_PARTS)
+    if _PARTS[goal.part](goal, target, place):
+        goal.part += 1
+    return goal.part == len(_PARTS)
 
 
 def of_this_model(model_epoch: int | None, epoch: int) -> None:
@@ -108,15 +108,15 @@ def of_this_model(model_epoch: int | None, epoch: int) -> None:
 # -- set-points in images -------------------------------------------------------------------------------------
 
 
-def _features(aim: GoalResolution, target: FeatureTarget, place: BodyState) -> None:
-    aim.set_points, aim.wanted = raw_set_points(target, place)
+def _features(goal: GoalResolution, target: FeatureTarget, place: BodyState) -> None:
+    goal.set_points, goal.wanted = raw_set_points(target, place)
 
 
-def _triangulated(aim: GoalResolution, place: BodyState) -> None:
+def _triangulated(goal: GoalResolution, place: BodyState) -> None:
     """Triangulate the markers at the goal from set-points. Raises RefusalError if too few are shown."""
     arrays = place.arrays
-    aim.targets, aim.known = _intersected(arrays.matrices, aim.set_points, aim.wanted, arrays.plane_at_infinity)
-    shown = int((aim.wanted.sum(axis=0) > 0).sum())
+    goal.targets, goal.known = _intersected(arrays.matrices, goal.set_points, goal.wanted, arrays.plane_at_infinity)
+    shown = int((goal.wanted.sum(axis=0) > 0).sum())
     needed = FEWEST_MARKERS[len(place.operators)]
     if shown < needed:
         raise RefusalError(
@@ -126,17 +126,17 @@ def _triangulated(aim: GoalResolution, place: BodyState) -> None:
             threshold=float(needed),
             unit="markers",
         )
-    aim.points = aim.targets
-    aim.pose_known = aim.needs_pose or int(aim.known.sum()) >= MIN_MARKERS
+    goal.points = goal.targets
+    goal.pose_known = goal.needs_pose or int(goal.known.sum()) >= MIN_MARKERS
 
 
 def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray, FloatArray]:
-    """Set-points (c, m, 2) as ideal pixels and wanted ones (c, m), of a target in raw pixels.
+    """Set-points (c, m, 2) as ideal pixels and required ones (c, m), of a target in raw pixels.
 
     Raises RefusalError for an impossible camera, marker or pixel.
     """
     arrays, cameras = place.arrays, place.settings.cameras
-    set_points, wanted = (
+    set_points, required = (
         np.zeros((len(cameras), len(arrays.marker_ids), 2)),
         np.zeros((len(cameras), len(arrays.marker_ids))),
     )
@@ -146,12 +146,12 @@ def raw_set_points(target: FeatureTarget, place: BodyState) -> tuple[FloatArray,
         given = _numbers(markers.values(), 2)
         ideal = ideal_pixels(arrays.lenses[camera], given)
         rows = marker_indices(markers, arrays)
-        set_points[camera, rows], wanted[camera, rows] = ideal, 1.0
+        set_points[camera, rows], required[camera, rows] = ideal, 1.0
         inside = (given >= -0.5) & (given <= np.array((shape.width, shape.height)) - 0.5) & np.isfinite(ideal)
         for k in np.flatnonzero(~inside.all(axis=1)):
             marker = tuple(markers)[k]
             require_imaged(shape, f"marker {marker}", markers[marker], ideal[k])
-    return set_points, wanted
+    return set_points, required
 
 
 @kernel
@@ -182,17 +182,17 @@ def require_imaged(camera: CameraSettings, what: str, raw: Pixel, ideal: FloatAr
 
 @kernel
 def _intersected(
-    matrices: FloatArray, set_points: FloatArray, wanted: FloatArray, plane: FloatArray
+    matrices: FloatArray, set_points: FloatArray, required: FloatArray, plane: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
     """Points (m, 4) of height 1 that two or more cameras show, else zeros; and which are known (m,).
 
     ``plane`` (4,): at infinity.
     """
-    points, known = triangulate(matrices, set_points, wanted, 5)
+    points, known = triangulate(matrices, set_points, required, 5)
     for i in range(points.shape[0]):
         views = 0.0
         for c in range(matrices.shape[0]):
-            views += wanted[c, i]
+            views += required[c, i]
         known[i] = known[i] and views >= 2.0
         height = 0.0
         for k in range(4):
@@ -245,7 +245,7 @@ def _numbers(rows: Iterable[Iterable[float]], width: int) -> FloatArray:
 # -- points and displacements ---------------------------------------------------------------------------------
 
 
-def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
+def _points(goal: GoalResolution, target: PointTarget, place: BodyState) -> None:
     arrays = place.arrays
     needed = FEWEST_MARKERS[len(place.operators)]
     if len(target.points) < needed:
@@ -257,7 +257,7 @@ def _points(aim: GoalResolution, target: PointTarget, place: BodyState) -> None:
             unit="markers",
         )
     targets, known = given_points(target, arrays)
-    _projected(aim, place, targets, known)
+    _projected(goal, place, targets, known)
 
 
 def given_points(target: PointTarget, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
@@ -313,7 +313,7 @@ def normalize_scale(point: FloatArray, arrays: ModelArrays, what: str, subject: 
     return scaled
 
 
-def _displacement(aim: GoalResolution, target: DisplacementTarget, place: BodyState) -> None:
+def _displacement(goal: GoalResolution, target: DisplacementTarget, place: BodyState) -> None:
     arrays = place.arrays
     matrix = np.array(target.matrix, dtype=np.float64).reshape(4, 4)
     if target.basis is None and target.model_epoch is None:
@@ -337,7 +337,7 @@ def _displacement(aim: GoalResolution, target: DisplacementTarget, place: BodySt
             value=lowest / highest if highest > 0.0 else 0.0,
             threshold=1.0,
         )
-    _projected(aim, place, moved / heights[:, None], np.ones(heights.size, dtype=bool))
+    _projected(goal, place, moved / heights[:, None], np.ones(heights.size, dtype=bool))
 
 
 def _proper(matrix: FloatArray) -> FloatArray:
@@ -372,9 +372,9 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
     if len(set(indices)) < 5:
         raise RefusalError("DEGENERATE_BASIS", f"basis {list(ids)} names a marker twice; five different are needed")
     M = np.ascontiguousarray(place.points[indices[:4]].T)
-    middle = place.points[indices].sum(axis=0) / 5.0
-    extent = float(np.sqrt(((place.points[indices] - middle) ** 2).sum(axis=-1).max()))
-    volume = abs(determinant4(M)) / (extent**3 * float(np.sqrt((middle * middle).sum())))
+    centroid = place.points[indices].sum(axis=0) / 5.0
+    extent = float(np.sqrt(((place.points[indices] - centroid) ** 2).sum(axis=-1).max()))
+    volume = abs(determinant4(M)) / (extent**3 * float(np.sqrt((centroid * centroid).sum())))
     fifth = (
         transform_points(invert4(M), np.ascontiguousarray(place.points[indices[4:]]))[0]
         if volume > COPLANAR**2
@@ -393,7 +393,7 @@ def _basis(ids: tuple[int, ...], place: BodyState) -> FloatArray:
     return E
 
 
-def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known: BoolArray) -> None:
+def _projected(goal: GoalResolution, place: BodyState, targets: FloatArray, known: BoolArray) -> None:
     """Set-points by projection of a body at ``targets`` (m, 4) of height 1 where ``known`` (m,)."""
     if int(known.sum()) >= MIN_MARKERS and mirrored(place.points, targets, known):
         raise RefusalError(
@@ -402,53 +402,53 @@ def _projected(aim: GoalResolution, place: BodyState, targets: FloatArray, known
         )
     in_front(place, targets, known)
     pixels, _ = view_of(place.settings, place.arrays, targets)
-    aim.wanted = np.repeat(known[None, :].astype(np.float64), len(place.arrays.matrices), axis=0)
-    aim.set_points = np.where(aim.wanted[..., None] > 0.0, pixels, 0.0)
-    aim.targets, aim.known, aim.pose_known = targets, known, True
+    goal.wanted = np.repeat(known[None, :].astype(np.float64), len(place.arrays.matrices), axis=0)
+    goal.set_points = np.where(goal.wanted[..., None] > 0.0, pixels, 0.0)
+    goal.targets, goal.known, goal.pose_known = targets, known, True
 
 
-def _shown_set_points(aim: GoalResolution, pose: GoalPose, target: Resolvable, place: BodyState) -> None:
+def _shown_set_points(goal: GoalResolution, pose: GoalPose, target: Resolvable, place: BodyState) -> None:
     """Set-points of a body at the goal: the error is taken over the markers stated as points, else over all that are in
     view.
     """
-    keeps_its_shape(pose.points, aim.targets, aim.known)
+    keeps_its_shape(pose.points, goal.targets, goal.known)
     pixels, shown = view_of(place.settings, place.arrays, pose.points)
-    shown = shown * (aim.wanted if isinstance(target, PointTarget) else 1.0)
-    enough_in_view(place, pixels, shown, aim.known)
+    shown = shown * (goal.wanted if isinstance(target, PointTarget) else 1.0)
+    enough_in_view(place, pixels, shown, goal.known)
     shown = shown * turned_to(place, pose.displacement)
     enough_shown(place, shown)
-    aim.set_points, aim.wanted = np.where(shown[..., None] > 0.0, pixels, 0.0), shown
+    goal.set_points, goal.wanted = np.where(shown[..., None] > 0.0, pixels, 0.0), shown
 
 
 # -- parts of a resolution ------------------------------------------------------------------------------------
 
 
-def _read(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+def _read(goal: GoalResolution, target: Resolvable, place: BodyState) -> bool:
     """Read the target, as ideal pixels or points of height 1."""
-    _READ[type(target)](aim, target, place)
+    _READ[type(target)](goal, target, place)
     return True
 
 
-def _find_face(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+def _find_face(goal: GoalResolution, target: Resolvable, place: BodyState) -> bool:
     """Find the markers at the goal, as far as two cameras determine them, and three of them that span a face."""
     if isinstance(target, FeatureTarget):
-        _triangulated(aim, place)
-    if int((aim.wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
-        _by_the_arm(aim, place)
-        aim.part = len(_PARTS) - 1  # the pose is known
+        _triangulated(goal, place)
+    if int((goal.wanted.sum(axis=0) > 0).sum()) < MIN_MARKERS:
+        _by_the_arm(goal, place)
+        goal.part = len(_PARTS) - 1  # the pose is known
         return True
-    if aim.pose_known:
-        aim.face = _face(aim.set_points, aim.wanted, aim.known, place.arrays)
+    if goal.pose_known:
+        goal.face = _face(goal.set_points, goal.wanted, goal.known, place.arrays)
     return True
 
 
-def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
+def _by_the_arm(goal: GoalResolution, place: BodyState) -> None:
     """Find the pose at a goal of too few markers to determine it alone: the one that an arm of few joints reaches with
     the least motion. Raises RefusalError if it reaches none.
     """
     arrays, cameras = place.arrays, place.settings.cameras
-    start = aim.joints if aim.joints.size else arrays.zero
-    reached = reached_pose(arrays, start, aim.set_points, aim.wanted)
+    start = goal.joints if goal.joints.size else arrays.zero
+    reached = reached_pose(arrays, start, goal.set_points, goal.wanted)
     if not reached.worst <= MAX_GOAL_RESIDUAL_PX:
         c, i = reached.camera, reached.marker
         u, v = (float(x) for x in reached.pixels[c, i])
@@ -462,49 +462,49 @@ def _by_the_arm(aim: GoalResolution, place: BodyState) -> None:
             unit="px",
             value=reached.worst if isfinite(reached.worst) else None,
         )
-    aim.points = aim.targets = reached.points
-    aim.known, aim.pose_known = np.ones(len(reached.points), dtype=bool), True
-    in_front(place, aim.points, aim.known)
-    there, here = chain_at(arrays, reached.joints)[0], chain_at(arrays, start)[0]
-    aim.displacement = _product(there, invert4(here))
+    goal.points = goal.targets = reached.points
+    goal.known, goal.pose_known = np.ones(len(reached.points), dtype=bool), True
+    in_front(place, goal.points, goal.known)
+    at_goal, at_start = chain_at(arrays, reached.joints)[0], chain_at(arrays, start)[0]
+    goal.displacement = _product(at_goal, invert4(at_start))
     pixels, shown = view_of(place.settings, arrays, reached.points)
-    aim.face = _face(pixels, shown, aim.known, arrays)
+    goal.face = _face(pixels, shown, goal.known, arrays)
 
 
-def _start_fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+def _start_fit(goal: GoalResolution, target: Resolvable, place: BodyState) -> bool:
     """Find a nearby displacement as the initial value of least squares."""
-    if not aim.pose_known:
+    if not goal.pose_known:
         return True
-    if aim.rounds == 0:
-        aim.displacement = np.eye(4)
-    steps = LAW_STEPS if place.arrays.sights <= AT_ONCE else STEPS
-    aim.displacement, near = displacement_by_law(
-        place.arrays, place.operators, place.points, aim.targets, aim.known, aim.face, aim.set_points, aim.wanted,
-        aim.displacement, steps,
+    if goal.rounds == 0:
+        goal.displacement = np.eye(4)
+    steps = LAW_STEPS if place.arrays.observation_count <= AT_ONCE else STEPS
+    goal.displacement, near = displacement_by_law(
+        place.arrays, place.operators, place.points, goal.targets, goal.known, goal.face, goal.set_points, goal.wanted,
+        goal.displacement, steps,
     )  # fmt: skip
-    aim.rounds += steps
-    if not near and aim.rounds < LAW_STEPS:
+    goal.rounds += steps
+    if not near and goal.rounds < LAW_STEPS:
         return False
-    aim.rounds = 0
+    goal.rounds = 0
     return True
 
 
-def _fit(aim: GoalResolution, target: Resolvable, place: BodyState) -> bool:
+def _fit(goal: GoalResolution, target: Resolvable, place: BodyState) -> bool:
     """Do iterations of least squares; after the last one, check that a rigid body fits."""
-    if not aim.pose_known:
+    if not goal.pose_known:
         return True
-    rounds = min(max(1, ROUNDS_OF_PIXELS // place.arrays.sights), REFINEMENTS - aim.rounds)
+    rounds = min(max(1, ROUNDS_OF_PIXELS // place.arrays.observation_count), REFINEMENTS - goal.rounds)
     basis = displacement_basis(place.arrays, place.operators)
     pose, converged = refined_pose(
-        place.arrays, basis, place.points, aim.displacement, aim.set_points, aim.wanted, rounds
+        place.arrays, basis, place.points, goal.displacement, goal.set_points, goal.wanted, rounds
     )
-    aim.rounds += rounds
-    aim.displacement, aim.points = pose.displacement, pose.points
-    if not converged and aim.rounds < REFINEMENTS:
+    goal.rounds += rounds
+    goal.displacement, goal.points = pose.displacement, pose.points
+    if not converged and goal.rounds < REFINEMENTS:
         return False
-    one_body(pose, place.points, aim.targets, aim.known)
+    one_body(pose, place.points, goal.targets, goal.known)
     if not isinstance(target, FeatureTarget):
-        _shown_set_points(aim, pose, target, place)
+        _shown_set_points(goal, pose, target, place)
     return True
 
 
@@ -522,7 +522,7 @@ _READ: dict[type[Any], Callable[[GoalResolution, Any, BodyState], None]] = {
 # -- the face -------------------------------------------------------------------------------------------------
 
 
-def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: ModelArrays) -> IntArray:
+def _face(set_points: FloatArray, required: FloatArray, known: BoolArray, arrays: ModelArrays) -> IntArray:
     """Three markers known at the goal that span the largest triangle in the images; of many markers, only well spread
     ones are tried.
     """
@@ -536,7 +536,7 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
             unit="markers",
         )
     found: IntArray
-    found, area = _largest_triangle(candidates, set_points, wanted)
+    found, area = _largest_triangle(candidates, set_points, required)
     if not area >= MIN_FACE_AREA_PX2:
         ids = [arrays.marker_ids[int(i)] for i in candidates]
         raise RefusalError(
@@ -550,11 +550,11 @@ def _face(set_points: FloatArray, wanted: FloatArray, known: BoolArray, arrays: 
 
 
 @kernel
-def _largest_triangle(candidates: IntArray, set_points: FloatArray, wanted: FloatArray) -> tuple[IntArray, float]:
+def _largest_triangle(candidates: IntArray, set_points: FloatArray, required: FloatArray) -> tuple[IntArray, float]:
     """Three of the ``candidates`` (k,) with the largest area, and twice that [px²]: the smallest over the cameras that
     see all three.
     """
-    tried = spread_in_images(candidates, set_points, wanted)
+    tried = spaced_in_images(candidates, set_points, required)
     best = tried[:3].copy()
     largest = -1.0
     for a in range(tried.shape[0]):
@@ -562,8 +562,8 @@ def _largest_triangle(candidates: IntArray, set_points: FloatArray, wanted: Floa
             for c in range(b + 1, tried.shape[0]):
                 i, j, k = tried[a], tried[b], tried[c]
                 least = math.inf
-                for camera in range(wanted.shape[0]):
-                    if min(wanted[camera, i], wanted[camera, j], wanted[camera, k]) > 0.0:
+                for camera in range(required.shape[0]):
+                    if min(required[camera, i], required[camera, j], required[camera, k]) > 0.0:
                         p = set_points[camera]
                         ux, uy = p[j, 0] - p[i, 0], p[j, 1] - p[i, 1]
                         vx, vy = p[k, 0] - p[i, 0], p[k, 1] - p[i, 1]

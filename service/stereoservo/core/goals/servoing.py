@@ -39,7 +39,7 @@ def law_of(goal: Goal, context: StepContext) -> tuple[LawName, Law]:
     return name, law
 
 
-def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> ServoGoal:
+def start_servoing(goal: Goal, resolved: GoalResolution, context: StepContext) -> ServoGoal:
     """The state of a law before its first step, for a goal that is resolved.
 
     Raises RefusalError naming the reason if the goal is unusable.
@@ -49,23 +49,23 @@ def start_servoing(goal: Goal, aim: GoalResolution, context: StepContext) -> Ser
     assert arrays is not None
     assert model is not None
     if goal.follow_markers:
-        require_followable(goal, LAWS[name].follows_streams, name, aim.pose_known, context)
-    weights, body, centre_target = _centre(goal.centre, aim, arrays, model.epoch)
+        require_followable(goal, LAWS[name].follows_streams, name, resolved.pose_known, context)
+    weights, body, centre_target = _centre(goal.centre, resolved, arrays, model.epoch)
     return ServoGoal(
-        **run_fields(goal, context, used_cameras(goal, aim.wanted, context)),
+        **run_fields(goal, context, used_cameras(goal, resolved.wanted, context)),
         law=name,
         jacobian=int(JACOBIANS[goal.jacobian or "mean"]),
-        set_points=aim.set_points,
-        wanted=aim.wanted,
-        rates=np.zeros_like(aim.set_points),
-        target_points=aim.points,
-        target_known=aim.known.astype(np.float64),
-        pose_known=aim.pose_known,
+        set_points=resolved.set_points,
+        wanted=resolved.wanted,
+        rates=np.zeros_like(resolved.set_points),
+        target_points=resolved.points,
+        target_known=resolved.known.astype(np.float64),
+        pose_known=resolved.pose_known,
         centre_weights=weights,
         centre_body=body,
         centre_target=centre_target,
-        faces=aim.faces,
-        choice=NOT_CHOSEN._replace(triple=aim.face),
+        faces=resolved.faces,
+        choice=NOT_CHOSEN._replace(triple=resolved.face),
     )
 
 
@@ -114,16 +114,16 @@ def _stable_damping(goal: Goal, gain: float, context: StepContext) -> float:
     return damping
 
 
-def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatArray:
-    """(c,) 1 for cameras that the law may use. Raises RefusalError if they show too few ``wanted`` (c, m)."""
+def used_cameras(goal: Goal, required: FloatArray, context: StepContext) -> FloatArray:
+    """(c,) 1 for cameras that the law may use. Raises RefusalError if they show too few ``required`` (c, m)."""
     c = len(context.settings.cameras)
     if goal.cameras is None:
         return np.ones(c)
     used = np.zeros(c)
     for name in goal.cameras:
         used[camera_index(name, context.settings)] = 1.0
-    shown = int((wanted * used[:, None]).max(axis=0).sum())
-    needed = markers_needed(wanted)
+    shown = int((required * used[:, None]).max(axis=0).sum())
+    needed = markers_needed(required)
     if shown < needed:
         raise RefusalError(
             "TOO_FEW_MARKERS",
@@ -137,7 +137,7 @@ def used_cameras(goal: Goal, wanted: FloatArray, context: StepContext) -> FloatA
 
 
 def _centre(
-    centre: Centre | None, aim: GoalResolution, arrays: ModelArrays, epoch: int
+    centre: Centre | None, resolved: GoalResolution, arrays: ModelArrays, epoch: int
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """A goal's centre: affine weights (m,) of the markers, or (weights zero) a point (4,) of the body; and the centre
     at the goal.
@@ -147,7 +147,7 @@ def _centre(
     weights = np.zeros(len(arrays.marker_ids))
     body = np.zeros(4)
     if centre is None:
-        weights = aim.known.astype(np.float64) / max(float(aim.known.sum()), 1.0)
+        weights = resolved.known.astype(np.float64) / max(float(resolved.known.sum()), 1.0)
     elif bool(centre.markers) == (centre.point is not None):
         raise RefusalError("CENTRE_UNCLEAR", "the centre is given either by markers or as a point, not by both or none")
     elif centre.point is not None:
@@ -155,13 +155,13 @@ def _centre(
             raise RefusalError("FRAME_UNKNOWN", "a point as centre needs the model_epoch in whose frame it is")
         of_this_model(centre.model_epoch, epoch)
         now = normalize_scale(np.array(centre.point), arrays, "the centre")[None]
-        H = chain_at(arrays, aim.joints)[0]
+        H = chain_at(arrays, resolved.joints)[0]
         body = transform_points(invert4(H), now)[0]
-        return weights, body, transform_points(aim.displacement, now)[0]
+        return weights, body, transform_points(resolved.displacement, now)[0]
     else:
         weights[marker_indices(centre.markers, arrays)] = 1.0
         weights = weights / float(weights.sum())
-    return weights, body, (weights[:, None] * aim.points).sum(axis=0)
+    return weights, body, (weights[:, None] * resolved.points).sum(axis=0)
 
 
 def unplanned_report(source: ServoGoal, context: StepContext) -> PlanReport:

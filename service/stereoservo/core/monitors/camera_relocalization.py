@@ -20,7 +20,7 @@ from stereoservo.core.context import RefusalError, StepContext
 from stereoservo.core.cycle import ModelUpdate, Sample
 from stereoservo.core.goals.execute import drop_lookahead_plan, end_followers, end_source
 from stereoservo.core.goals.marker_body import BodyState, place_now
-from stereoservo.core.goals.resolve import aim_at
+from stereoservo.core.goals.resolve import resolve
 from stereoservo.core.model_arrays import ModelArrays, model_arrays, with_unit_height
 from stereoservo.core.monitor_state import MOVED, ModelDiagnosis, ObservationStatistics, Relocalization
 from stereoservo.core.monitors.fault_isolation import LEAST_PX, doubt, named, present_problem
@@ -117,12 +117,12 @@ def reasons(state: CoreState) -> tuple[Reason, ...]:
     doing = {
         "brake": "the arm comes to rest",
         "collect": "looking at rest",
-        "wait": "it is being found anew",
+        "wait": "it is being relocalized",
         "take": "its new place is taken over",
         "verify": "its new place is verified",
     }[run.phase]
     if run.doubt:
-        return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to look once more"),)
+        return (_doubtful(run, f"{run.doubt}. {doing[0].upper()}{doing[1:]}, to collect more frames"),)
     return (
         Reason(
             "CAMERA_MOVED",
@@ -140,11 +140,11 @@ def _doubtful(run: Relocalization, hint: str) -> Reason:
     return Reason("CAMERAS_OR_ARM", "hold", ", ".join(run.cameras), run.moved_px, LEAST_PX, "px", hint)
 
 
-def misfit(state: CoreState, update: ModelUpdate) -> str:
+def rejection_reason(state: CoreState, update: ModelUpdate) -> str:
     """Why a relocalized model is not the expected one; empty if it is."""
     run, model = state.reanchoring, state.model
     if run is None or model is None or run.phase != "wait":
-        return "no cameras are being found anew, or they have moved again since"
+        return "no cameras are being relocalized, or they have moved again since"
     if set(update.reanchored) != set(run.cameras):
         return f"it is re-anchored for {', '.join(update.reanchored)}; {', '.join(run.cameras)} moved"
     same = np.array_equal(update.model.plane_at_infinity, model.plane_at_infinity) and np.array_equal(
@@ -191,10 +191,10 @@ def step(context: StepContext) -> None:
         if not resting:
             run.phase_ns = context.now_ns
         elif (context.now_ns - run.phase_ns) * 1e-9 >= SETTLE_S:
-            _begin_to_look(run, context)
+            _begin_collecting(run, context)
     elif run.phase == "collect":
         if resting:
-            _look(run, context)
+            _collect(run, context)
         else:
             _enter(run, "brake", context)
     elif run.phase == "wait":
@@ -224,7 +224,7 @@ def refused(command: ReanchorRefused, context: StepContext) -> str:
     """The fit could not determine the cameras. Raises RefusalError if no fit was requested."""
     run = context.state.reanchoring
     if run is None or run.phase != "wait":
-        raise RefusalError("NOT_AWAITED", "no cameras are being found anew")
+        raise RefusalError("NOT_AWAITED", "no cameras are being relocalized")
     _fail(run, context, command.message, command.value, command.unit, command.threshold)
     return "the cameras stay unknown"
 
@@ -234,7 +234,7 @@ def _enter(run: Relocalization, phase: str, context: StepContext) -> None:
     run.phase_ns = context.now_ns
 
 
-def _begin_to_look(run: Relocalization, context: StepContext) -> None:
+def _begin_collecting(run: Relocalization, context: StepContext) -> None:
     _enter(run, "collect", context)
     run.sums = ObservationStatistics(**measurement_buffers(context.settings))
     run.joint_sum = np.zeros_like(context.q)
@@ -258,8 +258,8 @@ def _moved_again(run: Relocalization, context: StepContext) -> bool:
         both = known & (sighting.seen > 0.0)
         if int(both.sum()) >= 3:
             looked = True
-            apart = np.sqrt(((sighting.innovation - run.reference[c])[both] ** 2).sum(axis=-1))
-            if float(np.median(apart)) > MOVED_AGAIN_PX:
+            shift = np.sqrt(((sighting.innovation - run.reference[c])[both] ** 2).sum(axis=-1))
+            if float(np.median(shift)) > MOVED_AGAIN_PX:
                 moved.append(camera.name)
         fresh = ~known & (sighting.seen > 0.0)
         run.reference[c][fresh] = sighting.innovation[fresh]
@@ -300,7 +300,7 @@ def _after(camera: int, t_ns: int, state: CoreState) -> bool:
     return state.watching.sightings[camera].t_ns + state.cameras[camera].offset_ns > t_ns
 
 
-def _look(run: Relocalization, context: StepContext) -> None:
+def _collect(run: Relocalization, context: StepContext) -> None:
     for camera, observation in context.ingested.observations:
         offset_ns = context.state.cameras[camera].offset_ns
         at_shutter = joints_at(context.state.history, observation.t_shutter_ns + offset_ns)
@@ -309,9 +309,9 @@ def _look(run: Relocalization, context: StepContext) -> None:
         ):
             run.joint_sum += at_shutter
             run.joint_frames += 1
-    wanted = _moved(run, context)
+    moved = _moved(run, context)
     waited_s = (context.now_ns - run.phase_ns) * 1e-9
-    if not bool((run.sums.frames[wanted] >= FRAMES).all()) and waited_s <= COLLECT_S:
+    if not bool((run.sums.frames[moved] >= FRAMES).all()) and waited_s <= COLLECT_S:
         return
     state = context.state
     if run.poses == 0 and _where_they_were(run, context):
@@ -345,7 +345,7 @@ def _look(run: Relocalization, context: StepContext) -> None:
         trial=run.poses,
         cameras=run.cameras,
         rigid=run.together,
-        message=f"{named(run.cameras)} seen at rest: to be found anew",
+        message=f"{named(run.cameras)} seen at rest: to be relocalized",
     )
     run.poses += 1
     _enter(run, "wait", context)
@@ -390,8 +390,8 @@ def _where_they_were(run: Relocalization, context: StepContext) -> bool:
         "health",
         id=goal,
         name="ok",
-        message=f"{named(run.cameras)}, seen at rest, stand where they stood: what was seen in motion was of other "
-        f"moments than stated, or passed by{on}",
+        message=f"{named(run.cameras)}, seen at rest, have not moved: what was seen in motion was of other "
+        f"instants than stated, or passed by{on}",
     )
     return True
 
@@ -422,8 +422,8 @@ def _fail(
     limit: float | None = None,
 ) -> None:
     hint = (
-        f"{named(run.cameras)} moved and could not be found anew: {why}. It is tried again when more is seen, when the "
-        "arm rests elsewhere, and on resume; or cancel the goal and calibrate"
+        f"{named(run.cameras)} moved and could not be relocalized: {why}. It is tried again when more is seen, when "
+        "the arm rests elsewhere, and on resume; or cancel the goal and calibrate"
     )
     reason = Reason("REANCHOR_FAILED", "hold", ", ".join(run.cameras), value, limit, unit, hint)
     _give_up(run, context, reason)
@@ -479,7 +479,7 @@ def carry_all(new: ModelArrays, moved: tuple[int, ...], epochs: tuple[int, int],
             end_source(context, "goal_aborted", (reason,), reason.hint)
 
 
-def taken(run: Relocalization, state: CoreState, now_ns: int) -> None:
+def on_model_applied(run: Relocalization, state: CoreState, now_ns: int) -> None:
     """The new model is in use: laws restart counting frames, and new frames must agree with it."""
     run.phase, run.phase_ns = "verify", now_ns
     if isinstance(state.source, LawRun):
@@ -549,23 +549,23 @@ def carry_run(source: LawRun, place: BodyState, new: ModelArrays, moved: tuple[i
     else:
         raise TypeError(f"a law of kind {type(source).__name__} has no set-points that are known")
     had = bool((source.wanted > 0.0).any())
-    _say_anew(source.set_points, source.wanted, points, known, place.settings, new, moved)
+    _reproject_set_points(source.set_points, source.wanted, points, known, place.settings, new, moved)
     shown = int((source.wanted.max(axis=0) > 0.0).sum()) if source.wanted.size else 0
     if had and shown < MIN_MARKERS:
         return _stale(source.goal.id, shown)
     return None
 
 
-def _intersected(set_points: FloatArray, wanted: FloatArray, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
+def _intersected(set_points: FloatArray, required: FloatArray, arrays: ModelArrays) -> tuple[FloatArray, BoolArray]:
     """Points (m, 4) of height 1 that two or more cameras show, and which are known (m,)."""
-    found, ok = triangulate(arrays.matrices, set_points, wanted, 5)
-    known = np.asarray(ok, dtype=bool) & (wanted.sum(axis=0) >= 2)
+    found, ok = triangulate(arrays.matrices, set_points, required, 5)
+    known = np.asarray(ok, dtype=bool) & (required.sum(axis=0) >= 2)
     return np.where(known[:, None], with_unit_height(found, arrays.plane_at_infinity), 0.0), known
 
 
-def _say_anew(
+def _reproject_set_points(
     set_points: FloatArray,
-    wanted: FloatArray,
+    required: FloatArray,
     points: FloatArray,
     known: BoolArray,
     settings: CoreSettings,
@@ -578,8 +578,8 @@ def _say_anew(
         side = np.sign(depths[c][known]).sum()
         for i in range(points.shape[0]):
             inside = known[i] and depths[c, i] * side > 0.0 and _raw_in_view(settings, new, c, pixels[c, i]) is not None
-            wanted[c, i] = wanted[c, i] if inside else 0.0
-            set_points[c, i] = pixels[c, i] if wanted[c, i] > 0.0 else 0.0
+            required[c, i] = required[c, i] if inside else 0.0
+            set_points[c, i] = pixels[c, i] if required[c, i] > 0.0 else 0.0
 
 
 def _raw_in_view(settings: CoreSettings, arrays: ModelArrays, camera: int, pixel: FloatArray) -> Pixel | None:
@@ -639,15 +639,15 @@ def _features(
     epoch = epochs[1] if target.model_epoch == epochs[0] else target.model_epoch
     if not set(names) & set(target.set_points):
         return msgspec.structs.replace(target, model_epoch=epoch)
-    aim = aim_at(target, place, True, epochs[0])
-    pixels, _ = project_points(new.matrices, np.ascontiguousarray(aim.points))
+    resolved = resolve(target, place, True, epochs[0])
+    pixels, _ = project_points(new.matrices, np.ascontiguousarray(resolved.points))
     said = dict(target.set_points)
     for c, name in zip(moved, names, strict=True):
-        anew = {
+        reprojected = {
             marker: _raw_in_view(place.settings, new, c, pixels[c, new.index[marker]])
             for marker in target.set_points.get(name, {})
         }
-        said[name] = {marker: pixel for marker, pixel in anew.items() if pixel is not None}
+        said[name] = {marker: pixel for marker, pixel in reprojected.items() if pixel is not None}
     said = {name: markers for name, markers in said.items() if markers}
     if len({marker for markers in said.values() for marker in markers}) < MIN_MARKERS:
         return None

@@ -126,17 +126,17 @@ def worst_contact(
     joint = int((by_effort if effort else by_following).argmax())
     name = settings.joint_names[joint]
     assert settings.contact is not None  # otherwise there were no limits
-    way = "is something in its way? Clear it, or resume and jog away from it; where nothing was, "
-    way += "raise safety.contact." if learning else "calibrate anew, or raise safety.contact."
+    remedy = "is something in its way? Clear it, or resume and jog away from it; where nothing was, "
+    remedy += "raise safety.contact." if learning else "calibrate again, or raise safety.contact."
     if effort:
         value, limit = float(efforts[joint]), float(effort_limits[joint])
         unit = settings.contact.effort_units[joint]
-        hint = f"joint {name} pushes with {value:.4g} {unit} more than a moment before, {limit:.4g} is allowed: "
-        return Reason("CONTACT_EFFORT", "hold", name, value, limit, unit, f"{hint}{way}effort")
+        hint = f"joint {name} pushes with {value:.4g} {unit} more than just before, {limit:.4g} is allowed: "
+        return Reason("CONTACT_EFFORT", "hold", name, value, limit, unit, f"{hint}{remedy}effort")
     value, limit = float(following[joint]), float(following_limits[joint])
     unit = settings.joint_unit(joint)
     hint = f"joint {name} is {value:.4g} {unit} from its set-point, {limit:.4g} is allowed: "
-    return Reason("CONTACT_FOLLOWING", "hold", name, value, limit, unit, f"{hint}{way}following")
+    return Reason("CONTACT_FOLLOWING", "hold", name, value, limit, unit, f"{hint}{remedy}following")
 
 
 # -- monitors -----------------------------------------------------------------------------------------------

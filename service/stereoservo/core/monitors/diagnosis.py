@@ -107,7 +107,7 @@ def camera_moved_findings(verdict: ModelDiagnosis, context: StepContext, *, fres
         camera_relocalization.begin(verdict, context)
         return
     state.readiness = ModelReadiness.SUSPECT
-    hint = f"{verdict.text}; it is not found anew by itself ([servo] reanchor): calibrate"
+    hint = f"{verdict.text}; it is not relocalized automatically ([servo] reanchor): calibrate"
     context.emit("model", message=hint, name=str(state.readiness), reasons=(reason,))
     if source.runs_law:
         yield Finding("abort", reason, hint)
@@ -137,8 +137,8 @@ def unmask_returned(watching: ModelMonitor, known: list[int], context: StepConte
             continue
         only, alone = slice(i, i + 1), np.ones(1)
         good = all(
-            camera_chi2(shown[only], spread[only], alone, MODEL_SIGMA_PX)[0] <= improbable(2.0)
-            for spread, shown in seen
+            camera_chi2(shown[only], covariance[only], alone, MODEL_SIGMA_PX)[0] <= improbable(2.0)
+            for covariance, shown in seen
         )
         watching.back[i] = watching.back[i] + 1 if good else 0
         if watching.back[i] >= BACK_ROUNDS:

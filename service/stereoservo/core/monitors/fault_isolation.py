@@ -41,10 +41,10 @@ SUSPECT_MARKERS = 3
 """Number of suspect markers, each of which is left out in turn."""
 FEWEST_ON_ARM = 4
 """Least number of markers on the arm for a camera to confirm that the arm agrees with its joint readings."""
-WAYS_OUT = (
+REMEDIES = (
     "Where cameras moved: put them back and resume, or calibrate. Where joints are off: calibrate --check "
     "--reset-zeros. Where the marker body moved on the arm: put it back and resume, or calibrate. Static markers in "
-    "view of every camera ([scene] static) tell them apart"
+    "view of every camera ([scene] static) distinguish them"
 )
 """Possible remedies, cause by cause, if moved cameras and a moved arm cannot be distinguished."""
 FEWEST_STATIC = 3
@@ -72,7 +72,7 @@ def thresholds_of(settings: CoreSettings, markers: int, cameras: int) -> Thresho
 
 
 def diagnosed(problem: LinearisedProblem) -> ModelDiagnosis:
-    """The diagnosis of the innovations of one moment."""
+    """The diagnosis of the innovations of one instant."""
     found = problem.diagnose()
     cause, other = found.cause, found.runner_up
     if found.kind == "nothing":
@@ -92,14 +92,15 @@ def diagnosed(problem: LinearisedProblem) -> ModelDiagnosis:
         return ModelDiagnosis(
             "unclear",
             moved_px=cause.effect_px,
-            text=f"the arm, or the marker body on it, stands elsewhere than its joints say ({cause.effect_px:.3g} px "
-            "rms): was the body mounted anew, was the arm pushed? Calibrate anew",
+            text=f"the arm, or the marker body on it, is not where its joints report ({cause.effect_px:.3g} px "
+            "rms): was the body remounted, was the arm pushed? Calibrate again",
         )
     return _described(problem, cause, words)
 
 
 class LinearisedProblem:
-    """The observations of one moment, with the arm at ``q`` (n,), in the cameras ``known``, prepared for several tests.
+    """The observations of one instant, with the arm at ``q`` (n,), in the cameras ``known``, prepared for several
+    tests.
 
     ``innovation`` (c, k, 2) [px] with ``weights`` (c, k) [1/px]; rows as in `prediction.FrameResiduals`.
     """
@@ -119,7 +120,7 @@ class LinearisedProblem:
         self.innovation, self.weights = innovation, weights
 
     def with_innovation(self, innovation: FloatArray) -> LinearisedProblem:
-        """The same moment with other innovations (c, k, 2) [px]."""
+        """The same instant with other innovations (c, k, 2) [px]."""
         other = copy(self)
         other.innovation = innovation
         return other
@@ -177,12 +178,12 @@ def doubt(problem: LinearisedProblem, moved: list[int], px: float) -> str:
         f"{named(names)} {'disagree' if some else 'disagrees'} with the joints by {px:.3g} px rms (limit "
         f"{LEAST_PX:g} px)"
     )
-    arm = "the arm stands elsewhere than its joints say (play, joint zeros, the marker body)"
+    arm = "the arm is not where its joints report (play, joint zeros, the marker body)"
     for name, kind, count in wanting:
         if kind == "stand":
             return (
-                f"{disagree}, but the {count} static points that camera {name} sees stand where they stood: that "
-                f"camera has not moved, {arm}. Nothing is found anew: run calibrate --check, or calibrate"
+                f"{disagree}, but the {count} static points that camera {name} sees are where they were: that "
+                f"camera has not moved, {arm}. Nothing is relocalized: run calibrate --check, or calibrate"
             )
     name, kind, count = wanting[0]
     why = (
@@ -191,8 +192,8 @@ def doubt(problem: LinearisedProblem, moved: list[int], px: float) -> str:
         else f"no one displacement of camera {name} explains its {count} static points and the arm"
     )
     return (
-        f"{disagree}: either {'all of them' if some else 'it'} moved, or {arm}; these cannot be told apart, "
-        f"for no other camera confirms the joints and {why}. {WAYS_OUT}"
+        f"{disagree}: either {'all of them' if some else 'it'} moved, or {arm}; these cannot be distinguished, "
+        f"for no other camera confirms the joints and {why}. {REMEDIES}"
     )
 
 
@@ -279,19 +280,19 @@ def _described(problem: LinearisedProblem, cause: IsolatedChange, words: str) ->
         return _proven(ModelDiagnosis(kind, names, degrees, 0.0, "degrees", px, text), problem)
     if cause.kind == "marker":
         marker = arrays.marker_ids[cause.index]
-        text = f"marker {marker} has slipped {by}: fix it where it was, or calibrate anew"
+        text = f"marker {marker} has slipped {by}: fix it where it was, or calibrate again"
         return ModelDiagnosis("marker_slipped", (str(marker),), px, 0.0, "px", px, text)
     joint = settings.joint_names[cause.index]
     deviation = _joint_deviation(problem, cause.index)
     if settings.joint_kinds[cause.index] == "revolute":
-        size, spread, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
+        size, sigma, unit = math.degrees(cause.amount), math.degrees(deviation), "degrees"
     else:
-        size, spread, unit = 1e3 * cause.amount, 1e3 * deviation, "mm"
+        size, sigma, unit = 1e3 * cause.amount, 1e3 * deviation, "mm"
     text = (
-        f"the zero of joint {joint} is off by {size:+.3g} ± {spread:.1g} {unit} ({px:.3g} px rms): calibrate "
+        f"the zero of joint {joint} is off by {size:+.3g} ± {sigma:.1g} {unit} ({px:.3g} px rms): calibrate "
         "--check --reset-zeros"
     )
-    return ModelDiagnosis("joint_zero", (joint,), size, spread, unit, px, text)
+    return ModelDiagnosis("joint_zero", (joint,), size, sigma, unit, px, text)
 
 
 def _joint_deviation(problem: LinearisedProblem, joint: int) -> float:
@@ -324,7 +325,7 @@ def without_joint_errors(problem: LinearisedProblem, believed: FloatArray) -> tu
 
 
 def diagnosed_beside_joint_errors(problem: LinearisedProblem, *, proven: bool) -> ModelDiagnosis:
-    """The diagnosis of the innovations of one moment for an arm whose joint readings may have errors; no diagnosis if
+    """The diagnosis of the innovations of one instant for an arm whose joint readings may have errors; no diagnosis if
     these explain the innovations.
     ``proven``: a camera is known to have moved; then errors of the joints alone do not revoke it.
 

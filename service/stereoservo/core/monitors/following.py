@@ -94,11 +94,11 @@ def worst_follower(allowed: FloatArray, now: FloatArray, late: FloatArray) -> tu
 
 
 @kernel
-def account_silence(block: Record, room: Record) -> None:
+def account_silence(block: Record, workspace: Record) -> None:
     """Add up the travel commanded to each joint, at the time of its arrival, and its duration, since the reading last
     changed, less the part that friction may hold back.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s = memory.joints, work.elapsed_s
     q, velocity, answers, friction = (
         work.q[:n],
@@ -135,7 +135,7 @@ STEADY = 0.1
 """Largest difference between the current and the arriving command of a joint, as a fraction, for a motion to be steady
 enough to measure the delay.
 """
-PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, TOWARDS = range(7)
+PHASE, RESTED_S, STOOD_AT, SENT_BEFORE, SINCE_S, PASSED_S, DIRECTION = range(7)
 """Rows of `DriveDelays.onset`."""
 
 
@@ -175,8 +175,8 @@ def measure_delays(command: FloatArray, q: FloatArray, answers: FloatArray, dt_s
                 onset[STOOD_AT, j], onset[SENT_BEFORE, j] = q[j], sent[j]
                 continue
             onset[PHASE, j], onset[SINCE_S, j], onset[PASSED_S, j] = SETS_OUT, 0.0, -1.0
-            if command[j] * onset[TOWARDS, j] < 0.0 and math.isfinite(samples[-1, j]):
-                onset[PHASE, j], onset[TOWARDS, j] = WAITS, command[j]  # it must pass through its play first
+            if command[j] * onset[DIRECTION, j] < 0.0 and math.isfinite(samples[-1, j]):
+                onset[PHASE, j], onset[DIRECTION, j] = WAITS, command[j]  # it must pass through its play first
         if onset[PHASE, j] != SETS_OUT:
             continue
         onset[SINCE_S, j] += dt_s
@@ -187,7 +187,7 @@ def measure_delays(command: FloatArray, q: FloatArray, answers: FloatArray, dt_s
             onset[PASSED_S, j] = 0.0
         late = onset[PASSED_S, j] > LONGEST_DELAY_S or (onset[PASSED_S, j] < 0.0 and onset[SINCE_S, j] > ONSET_S)
         if abs(made) >= travel or late:
-            onset[PHASE, j], onset[TOWARDS, j] = WAITS, was_sent
+            onset[PHASE, j], onset[DIRECTION, j] = WAITS, was_sent
             if not late and onset[PASSED_S, j] >= 0.0 and made * was_sent > 0.0:
                 _push(samples[:, j], onset[PASSED_S, j])
                 median_s = _median(samples[:, j])
@@ -215,16 +215,16 @@ def _median(samples: FloatArray) -> float:
 
 
 @kernel
-def account_travel(block: Record, room: Record, command: FloatArray, fresh: bool, delays: DriveDelays) -> None:
+def account_travel(block: Record, workspace: Record, command: FloatArray, fresh: bool, delays: DriveDelays) -> None:
     """Update the travel by the time since the last step at the velocities ``command`` (n,): without delay in the
     ``block``'s untold and missing travel, with delay in ``delays``.
 
     ``fresh``: whether the readings are new. If a joint in steady motion has moved farther than its delay allows, its
     delay is shorter; the shorter one is added to the samples.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, dt_s, step = memory.joints, work.elapsed_s, memory.delay_steps
-    delay_s, samples, _, sent, past, velocity, under_way, accounted, missing_late = delays
+    delay_s, samples, _, sent, past, velocity, in_transit, accounted, missing_late = delays
     untold, missing, answers = memory.untold_travel[:n], memory.missing_travel[:n], work.answers[:n]
     forgotten = max(0.0, 1.0 - dt_s / MEMORY_S)
     rows = past.shape[0]
@@ -233,7 +233,7 @@ def account_travel(block: Record, room: Record, command: FloatArray, fresh: bool
         past[step % rows, j] = sent[j]
         back = min(round(delay_s[j] / work.period_s), rows - 2)
         arrived = past[(step - back) % rows, j]
-        under_way[j] = sent[j] - arrived
+        in_transit[j] = sent[j] - arrived
         if back == 0:
             velocity[j] = command[j]
         elif dt_s > 0.0:

@@ -41,7 +41,7 @@ from stereoservo.core.monitors.fault_isolation import (
     FEWEST_ON_ARM,
     FEWEST_STATIC,
     LEAST_PX,
-    WAYS_OUT,
+    REMEDIES,
     named,
     thresholds_of,
 )
@@ -101,7 +101,7 @@ def start(
             "warning",
             name=names,
             message=f"mobile: {names} cannot be adjusted while it moves, for the model is not metric: it is treated "
-            "like a camera that stands, and found anew at rest",
+            "like a camera that stands, and relocalized at rest",
         )
 
 
@@ -121,7 +121,7 @@ def with_adjusted(state: CoreState, model: CellModel, reanchored: tuple[str, ...
 
 
 def see(
-    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, sights: FrameResiduals,
+    state: CoreState, settings: CoreSettings, arrays: ModelArrays, camera: int, frame: FrameResiduals,
     prediction: Prediction, q: FloatArray, emit: Emit,
 ) -> FrameResiduals:  # fmt: skip
     """Process one frame of a camera, with the arm at ``q`` (n,) at its shutter time; returns the residuals that may be
@@ -129,74 +129,74 @@ def see(
     """
     mobile = state.mobile[camera]
     if mobile is None or settings.cameras[camera].name in unknown_cameras(state):
-        return sights
-    hidden = msgspec.structs.replace(sights, seen=np.zeros_like(sights.seen))
+        return frame
+    hidden = msgspec.structs.replace(frame, seen=np.zeros_like(frame.seen))
     if state.lifecycle in (Lifecycle.FAULT, Lifecycle.UNCONFIGURED):
-        return hidden if mobile.moving else sights  # readings of a faulty drive must not be used to judge cameras
-    points, observed, weights = _known(state, arrays, camera, sights, prediction, q)
+        return hidden if mobile.moving else frame  # readings of a faulty drive must not be used to judge cameras
+    points, observed, weights = _known(state, arrays, camera, frame, prediction, q)
     basis, gate = arrays.metric_basis, gate_threshold(settings.gate_sigma)
     assert basis is not None
     P = arrays.matrices[camera]
     found = adjust(moved_matrix(P, mobile.reference), points, observed, weights, basis, gate)
     if not mobile.moving:
-        late = late_alone(observed - pixels_of(P, points), sights.velocity, weights)
+        late = late_alone(observed - pixels_of(P, points), frame.velocity, weights)
         if late or not _sets_out(state, settings, arrays, camera, found, int((weights > 0.0).sum())):
-            return sights
-        _set_out(mobile, camera, settings, sights.t_shutter_ns, emit)
+            return frame
+        _set_out(mobile, camera, settings, frame.t_shutter_ns, emit)
         state.cameras[camera].rejected_frames = 0
     mobile.seen = int((weights > 0.0).sum())
     if found is None:
         mobile.lost += 1
         mobile.still, mobile.doubtful = 0, False
     else:
-        _follow(mobile, P, points, sights, found)
+        _follow(mobile, P, points, frame, found)
         mobile.static_moved = _static_moved(P, mobile.way, points, found.weights, len(arrays.marker_ids))
-        mobile.lost, mobile.found_ns = 0, sights.t_shutter_ns
+        mobile.lost, mobile.found_ns = 0, frame.t_shutter_ns
     return hidden
 
 
 def _known(
-    state: CoreState, arrays: ModelArrays, camera: int, sights: FrameResiduals, prediction: Prediction, q: FloatArray
+    state: CoreState, arrays: ModelArrays, camera: int, frame: FrameResiduals, prediction: Prediction, q: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points (k, 4) at the positions given by the corrected joints ``q``, with the static ones; the pixels at which the
     camera saw them (k, 2) and their weights (k,) [1/px].
     """
     H = chain_at(arrays, q + state.block.correction)[0]
     points = np.concatenate((transform_points(H, arrays.marker_points), arrays.scene_points))
-    observed = np.concatenate((prediction.pixels[0], arrays.scene_pixels[camera])) + sights.innovation
-    variance = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1]) + MODEL_SIGMA_PX**2
-    weights = np.where(sights.seen, 1.0 / np.sqrt(variance), 0.0)
+    observed = np.concatenate((prediction.pixels[0], arrays.scene_pixels[camera])) + frame.innovation
+    variance = 0.5 * (frame.covariance[:, 0, 0] + frame.covariance[:, 1, 1]) + MODEL_SIGMA_PX**2
+    weights = np.where(frame.seen, 1.0 / np.sqrt(variance), 0.0)
     weights[: len(state.watching.masked)] *= 1.0 - state.watching.masked
     return points, observed, weights
 
 
-def _follow(mobile: MobileCamera, P: FloatArray, points: FloatArray, sights: FrameResiduals, found: Adjusted) -> None:
+def _follow(mobile: MobileCamera, P: FloatArray, points: FloatArray, frame: FrameResiduals, found: Adjusted) -> None:
     """Update the camera's pose by an explained frame, and decide whether it has moved since the frames before."""
     then = moved_matrix(P, mobile.reference)
-    way = np.empty((4, 4))
-    multiply4_into(mobile.reference, found.D, way)
+    motion = np.empty((4, 4))
+    multiply4_into(mobile.reference, found.D, motion)
     used = found.weights > 0.0
-    distance = apart(then, moved_matrix(P, way), points, used)
-    noise = 0.5 * (sights.spread[:, 0, 0] + sights.spread[:, 1, 1])
+    distance = shift_px(then, moved_matrix(P, motion), points, used)
+    noise = 0.5 * (frame.covariance[:, 0, 0] + frame.covariance[:, 1, 1])
     # The pixels of an estimate of six parameters deviate by chi-square with six degrees of freedom in total; those of
     # two, by twice that.
     random = math.sqrt(2.0 * _STILL_CHI2 * float(noise[used].sum())) / float(used.sum())
     if mobile.still == 0 or distance > STILL_PX + random:
-        mobile.reference = way
+        mobile.reference = motion
         mobile.twists = np.zeros(FREEDOMS)
         mobile.still, mobile.doubtful = 1, False
     else:
         mobile.twists = mobile.twists + found.twist
         mobile.still += 1
-    mobile.way = way
-    mobile.moved_px = apart(P, moved_matrix(P, way), points, used)
+    mobile.way = motion
+    mobile.moved_px = shift_px(P, moved_matrix(P, motion), points, used)
 
 
-def _static_moved(P: FloatArray, way: FloatArray, points: FloatArray, weights: FloatArray, markers: int) -> bool:
+def _static_moved(P: FloatArray, motion: FloatArray, points: FloatArray, weights: FloatArray, markers: int) -> bool:
     """Whether enough static points, after the ``markers`` in ``points``, moved in the image with the camera."""
     static = weights > 0.0
     static[:markers] = False
-    return int(static.sum()) >= FEWEST_STATIC and apart(P, moved_matrix(P, way), points, static) >= LEAST_PX
+    return int(static.sum()) >= FEWEST_STATIC and shift_px(P, moved_matrix(P, motion), points, static) >= LEAST_PX
 
 
 def _sets_out(
@@ -264,9 +264,9 @@ def step(context: StepContext) -> None:
         elif mobile.still >= STILL_FRAMES and state.planning is None and not state.pending_reanchored:
             mobile.doubtful = not _proven(c, context)
             if not mobile.doubtful:
-                _stand(c, mobile, context)
+                _resume_moved(c, mobile, context)
             elif mobile.moved_px < LEAST_PX:
-                _stand_as_before(c, context)
+                _resume_unmoved(c, context)
         elif mobile.lost:
             _hand_over(c, mobile, context)
     if context.arrays is not None and context.arrays is not arrays:
@@ -287,13 +287,13 @@ def _proven(c: int, context: StepContext) -> bool:
         sighting, other = state.watching.sightings[d], state.mobile[d]
         age_s = (context.now_ns - sighting.t_ns) * 1e-9
         recent = not sighting.looked or age_s * camera.rate_hz <= STALE_PERIODS
-        stands = other is None or (not other.moving and state.cameras[d].rejected_frames == 0)
-        if d != c and stands and recent and int(sighting.seen[:m].sum()) >= FEWEST_ON_ARM:
+        static = other is None or (not other.moving and state.cameras[d].rejected_frames == 0)
+        if d != c and static and recent and int(sighting.seen[:m].sum()) >= FEWEST_ON_ARM:
             return True
     return False
 
 
-def _stand_as_before(c: int, context: StepContext) -> None:
+def _resume_unmoved(c: int, context: StepContext) -> None:
     """End an apparent motion: the camera has the pose that the model states."""
     name = context.settings.cameras[c].name
     context.state.mobile[c] = standing_camera()
@@ -301,16 +301,16 @@ def _stand_as_before(c: int, context: StepContext) -> None:
     context.emit("health", name="ok", message=message, cameras=(name,))
 
 
-def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
+def _resume_moved(c: int, mobile: MobileCamera, context: StepContext) -> None:
     """Set the camera's pose to the mean of the frames that agree."""
     state, arrays, model = context.state, context.arrays, context.state.model
     assert arrays is not None
     assert model is not None
     assert context.weights is not None
     name = context.settings.cameras[c].name
-    way = mean_way(mobile, arrays)
+    motion = mean_motion(mobile, arrays)
     matrices = arrays.matrices.copy()
-    matrices[c] = moved_matrix(arrays.matrices[c], way)
+    matrices[c] = moved_matrix(arrays.matrices[c], motion)
     new = _arrays_with(arrays, matrices)
     carry_all(new, (c,), (model.epoch, model.epoch), context)
     state.model = msgspec.structs.replace(
@@ -333,7 +333,7 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
         matrix=matrices[c].copy(),
         epoch=model.epoch,
         message=f"camera {name} stands again, {(context.now_ns - mobile.since_ns) * 1e-9:.1f} s after it set out: "
-        f"turned by {math.degrees(angle(way)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
+        f"turned by {math.degrees(angle(motion)):.3g} degrees, its picture moved by {mobile.moved_px:.3g} px",
     )
     prediction = predict(new, context.q)
     weights = context.weights.copy()
@@ -342,13 +342,13 @@ def _stand(c: int, mobile: MobileCamera, context: StepContext) -> None:
     context.pixels = pixels_now(prediction, state.cameras)
 
 
-def mean_way(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
+def mean_motion(mobile: MobileCamera, arrays: ModelArrays) -> FloatArray:
     """Displacement (4, 4) from the camera's last static pose to the mean of the frames that agree."""
     assert arrays.metric_basis is not None
     twist = mobile.twists / max(float(mobile.still), 1.0)
-    way = np.empty((4, 4))
-    multiply4_into(mobile.reference, exp_twist((twist[:, None, None] * arrays.metric_basis).sum(axis=0)), way)
-    return way
+    motion = np.empty((4, 4))
+    multiply4_into(mobile.reference, exp_twist((twist[:, None, None] * arrays.metric_basis).sum(axis=0)), motion)
+    return motion
 
 
 def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
@@ -367,7 +367,7 @@ def _hand_over(c: int, mobile: MobileCamera, context: StepContext) -> None:
 # -- queries of other stages ----------------------------------------------------------------------------------
 
 
-def to_look_from(arrays: ModelArrays, context: StepContext) -> tuple[Prediction, list[int], tuple[str, ...]]:
+def prediction_for_priors(arrays: ModelArrays, context: StepContext) -> tuple[Prediction, list[int], tuple[str, ...]]:
     """For the priors: the prediction with moving cameras at their current poses, the indices of these cameras, and the
     names of those whose pose is unknown.
     """
@@ -413,9 +413,9 @@ def reasons(state: CoreState, settings: CoreSettings) -> tuple[Reason, ...]:
     if len(doubtful) == len(names):
         px = max(mobile.moved_px for mobile in doubtful)
         hint = (
-            f"{named(names)} shows the arm {px:.3g} px rms from where its joints say: either the camera moved, or the "
-            "arm stands elsewhere than its joints say (play, joint zeros, the marker body); no camera that stands sees "
-            f"the arm, and no {FEWEST_STATIC} static points moved. {WAYS_OUT}, and a camera that stands and sees the "
+            f"{named(names)} shows the arm {px:.3g} px rms from where its joints report: either the camera moved, or "
+            "the arm is not where its joints report (play, joint zeros, the marker body); no camera that stands sees "
+            f"the arm, and no {FEWEST_STATIC} static points moved. {REMEDIES}, and a camera that stands and sees the "
             "arm"
         )
         return (Reason("CAMERAS_OR_ARM", "hold", ", ".join(names), px, LEAST_PX, "px", hint),)
@@ -543,15 +543,15 @@ def late_alone(innovation: FloatArray, velocity: FloatArray, weights: FloatArray
     return abs(late_s) <= LATE_S and float((rest**2).sum()) <= _unexplained(freedoms)
 
 
-def moved_matrix(P: FloatArray, way: FloatArray) -> FloatArray:
-    """``P way`` (3, 4), without BLAS."""
-    product: FloatArray = (P[:, :, None] * way[None]).sum(axis=1)
+def moved_matrix(P: FloatArray, motion: FloatArray) -> FloatArray:
+    """``P motion`` (3, 4), without BLAS."""
+    product: FloatArray = (P[:, :, None] * motion[None]).sum(axis=1)
     return product
 
 
-def angle(displacement: FloatArray) -> float:
+def angle(motion: FloatArray) -> float:
     """Angle [rad] of a displacement (4, 4) in any frame, by its trace 2 + 2 cos."""
-    trace = float(np.trace(displacement))
+    trace = float(np.trace(motion))
     return math.acos(min(max(0.5 * trace - 1.0, -1.0), 1.0))
 
 
@@ -568,7 +568,7 @@ def _side(P: FloatArray, points: FloatArray, weights: FloatArray) -> float:
     return float(np.sign(depths[seen]).sum()) / max(float(seen.sum()), 1.0)
 
 
-def apart(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
+def shift_px(P: FloatArray, Q: FloatArray, points: FloatArray, used: BoolArray) -> float:
     """Rms distance [px] between the images of the points ``used`` in two cameras."""
     squares = ((pixels_of(P, points) - pixels_of(Q, points)) ** 2).sum(axis=-1)
     return math.sqrt(float(squares[used].sum()) / max(float(used.sum()), 1.0))

@@ -167,7 +167,7 @@ def record_joints(trials: TrialMotion, context: StepContext) -> None:
         trials.path_joints.append(context.q.copy())
 
 
-def taken_path(trials: TrialMotion, leg: int = 0) -> PathRecord:
+def driven_path(trials: TrialMotion, leg: int = 0) -> PathRecord:
     """The record of the path so far; recording restarts."""
     frames, times, joints = trials.path_frames, trials.path_ns, trials.path_joints
     trials.path_frames, trials.path_ns, trials.path_joints = [], [], []
@@ -176,7 +176,7 @@ def taken_path(trials: TrialMotion, leg: int = 0) -> PathRecord:
 
 def _path_record(trials: CalibrationMotion) -> PathRecord | None:
     """The record of the path that ends here, if it is whole and shows motion."""
-    record = taken_path(trials)
+    record = driven_path(trials)
     return None if len(record.joints_ns) == PATH_JOINTS or len(record.frames) < 2 else record
 
 
@@ -293,14 +293,14 @@ def _next(trials: CalibrationMotion, context: StepContext, settings: TrialSettin
     """Choose the next stop: further on this side, the other side, the next joint, or home."""
     while True:
         if _combining(trials):
-            if not _aim_all(trials, context, settings):
+            if not _set_all_targets(trials, context, settings):
                 trials.target = settings.base.copy()
                 enter(trials, "finish", context)
             return rest(context)
         if trials.joint >= 0:
             if trials.step == 0.0:  # its range is not known yet
                 size = probe_size(context.settings.joint_kinds[trials.joint])
-                if _aim(trials, context, settings, trials.side * size):
+                if _set_target(trials, context, settings, trials.side * size):
                     return rest(context)
                 _probe_failed(trials)
                 continue
@@ -328,7 +328,7 @@ def _begin_joint(trials: CalibrationMotion, context: StepContext, settings: Tria
     trials.side, trials.k, trials.step, trials.count = 1, 0, 0.0, 0
     _at_base(trials)
     if _planned(trials, settings):
-        trials.reach = room(trials.joint, context.settings, settings)
+        trials.reach = span(trials.joint, context.settings, settings)
         return
     trials.step = float(2.0 * settings.range[trials.joint] / (settings.stops - 1))
     trials.count = settings.stops // 2
@@ -376,7 +376,7 @@ def _further(trials: CalibrationMotion, context: StepContext, settings: TrialSet
     elif not _promising(trials, context, settings, offset):
         return False
     trials.k += 1
-    if _aim(trials, context, settings, offset):
+    if _set_target(trials, context, settings, offset):
         return True
     trials.k -= 1
     return False
@@ -390,7 +390,7 @@ def _promising(trials: CalibrationMotion, context: StepContext, settings: TrialS
     """
     if trials.k == 0 or trials.count == 0:
         return trials.count > 0
-    most = room(trials.joint, context.settings, settings)[0 if trials.side > 0 else 1]
+    most = span(trials.joint, context.settings, settings)[0 if trials.side > 0 else 1]
     crowded = int(trials.stops[trials.joint]) >= MOST_STOPS * settings.stops
     if trials.k >= trials.count and (abs(offset) > most or crowded):
         return False
@@ -398,7 +398,7 @@ def _promising(trials: CalibrationMotion, context: StepContext, settings: TrialS
     return enough_inside(ahead, context.settings, settings)
 
 
-def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float) -> bool:
+def _set_target(trials: CalibrationMotion, context: StepContext, settings: TrialSettings, offset: float) -> bool:
     """Start for ``offset`` from the base, unless a limit or a keep-out forbids it."""
     target = settings.base.copy()
     target[trials.joint] += offset
@@ -422,7 +422,7 @@ def _aim(trials: CalibrationMotion, context: StepContext, settings: TrialSetting
     return True
 
 
-def _aim_all(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
+def _set_all_targets(trials: CalibrationMotion, context: StepContext, settings: TrialSettings) -> bool:
     """Start for the next stop of all joints at once; False after the last."""
     everything = list(range(len(trials.stops)))
     low, high = trials.lowest - settings.base, trials.highest - settings.base
@@ -502,7 +502,7 @@ GOLDEN = 0.6180339887498949
 UNEVEN_STEP = 0.5
 """Largest fraction of a step by which the stops of a single joint are moved towards the base."""
 SHARE, UNEVEN = 0.8, 0.5
-"""Largest offset of a joint from the middle of its range, as a fraction of half the range in which it was driven; and
+"""Largest offset of a joint from the centre of its range, as a fraction of half the range in which it was driven; and
 the fraction of this offset by which stops differ, so that a gear's ripple does not repeat and errors that grow with the
 range become visible.
 """
@@ -563,7 +563,7 @@ def probe_size(kind: JointKindName) -> float:
     return PROBE[kind]
 
 
-def room(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
+def span(joint: int, core: CoreSettings, settings: TrialSettings) -> FloatArray:
     """Range (2,) of a joint upwards and downwards from its base: its limits, and a reasonable largest range."""
     limits = core.limits
     margin = limits.position_margin + 4.0 * core.arrival[joint]
@@ -648,7 +648,7 @@ def plan_sides(
             min(
                 [float(reach[i])]
                 + [
-                    _way(base[p, c], sign * rates[p, c], camera.width, camera.height, settings)
+                    _travel_to_border(base[p, c], sign * rates[p, c], camera.width, camera.height, settings)
                     for p in np.flatnonzero(np.isfinite(probe - base).any(axis=(1, 2, 3)))
                     for c, camera in enumerate(core.cameras)
                 ]
@@ -666,23 +666,23 @@ def plan_sides(
     return found, steps, counts
 
 
-def _way(pixels: FloatArray, rates: FloatArray, width: int, height: int, settings: TrialSettings) -> float:
+def _travel_to_border(pixels: FloatArray, rates: FloatArray, width: int, height: int, settings: TrialSettings) -> float:
     """Joint offset at which too few markers (m, 2), moving at ``rates`` (m, 2) [px a unit], are left inside."""
     margin = BORDER * width
     low, high = np.full(2, margin), np.array([width, height]) - 1.0 - margin
-    ways = []
+    travels = []
     for pixel, rate in zip(pixels, rates, strict=True):
         if not (np.isfinite(pixel).all() and np.isfinite(rate).all()):
             continue
-        way = np.inf
+        travel = np.inf
         for x, v, a, b in zip(pixel, rate, low, high, strict=True):
             if v != 0.0:
-                way = min(way, max(0.0, ((b if v > 0.0 else a) - x) / v))
-        ways.append(way)
-    if not ways:
+                travel = min(travel, max(0.0, ((b if v > 0.0 else a) - x) / v))
+        travels.append(travel)
+    if not travels:
         return 0.0
-    ways.sort(reverse=True)
-    return float(ways[min(int(_needed(len(ways), settings)), len(ways)) - 1])
+    travels.sort(reverse=True)
+    return float(travels[min(int(_needed(len(travels), settings)), len(travels)) - 1])
 
 
 def too_little(
@@ -702,7 +702,7 @@ def too_little(
     wider = (
         f"raise calibration.range.{name}"
         if stated
-        else "put the base where this joint has more room before the border of a view or its limit"
+        else "put the base where this joint has more range before the border of a view or its limit"
     )
     at_stops, least_stops = ("", "") if stops is None else (f"at {stops} stops ", f"{MIN_STOPS} stops over ")
     if (stops is not None and stops < MIN_STOPS) or visited < settings.min_range:

@@ -81,8 +81,8 @@ def _steps(settings: CoreSettings, model: CellModel, middle: FloatArray) -> Floa
         driven = np.array([known.get(name, r) for name, r in zip(settings.joint_names, driven, strict=True)])
     limits = settings.limits
     margin = limits.position_margin + 4.0 * settings.arrival
-    room = np.minimum(limits.position_max - margin - middle, middle - limits.position_min - margin)
-    return np.maximum(np.minimum(SHARE * np.where(np.isfinite(driven), driven, 0.1), room), 0.0)
+    remaining = np.minimum(limits.position_max - margin - middle, middle - limits.position_min - margin)
+    return np.maximum(np.minimum(SHARE * np.where(np.isfinite(driven), driven, 0.1), remaining), 0.0)
 
 
 def start_check(command: Calibrate, context: StepContext, model: CellModel) -> CheckMotion:

@@ -83,38 +83,38 @@ def start_incidence(goal: Goal, target: IncidenceTarget, context: StepContext, p
         markers[i, : len(own)] = own
         fixed[i] = _fixed(spec.fixed, standing, name, place, target.model_epoch)
         names.append(name)
-    joints, joints_wanted = np.zeros(n), np.zeros(n)
+    joints, joints_required = np.zeros(n), np.zeros(n)
     c, m = len(context.settings.cameras), len(place.points)
-    set_points, wanted = np.zeros((c, m, 2)), np.zeros((c, m))
+    set_points, required = np.zeros((c, m, 2)), np.zeros((c, m))
     if isinstance(target.secondary, JointTarget):
         for joint, position in target.secondary.positions.items():
             j = joint_index(joint, context.settings)
-            joints[j], joints_wanted[j] = position, 1.0
+            joints[j], joints_required[j] = position, 1.0
     elif target.secondary is not None:
         of_this_model(target.secondary.model_epoch, model.epoch)
-        set_points, wanted = raw_set_points(target.secondary, place)
+        set_points, required = raw_set_points(target.secondary, place)
     source = IncidenceGoal(
         **run_fields(goal, context, used_cameras(goal, np.ones((c, m)), context)),
-        kinds=kinds, markers=markers, fixed=fixed, names=tuple(names), joints=joints, joints_wanted=joints_wanted,
-        set_points=set_points, wanted=wanted,
+        kinds=kinds, markers=markers, fixed=fixed, names=tuple(names), joints=joints, joints_wanted=joints_required,
+        set_points=set_points, wanted=required,
     )  # fmt: skip
     _drivable(source, context, place)
     return source
 
 
-def _one_way(feature: Feature, name: str, which: str) -> None:
-    ways = [w for w in ("markers", "points", "pixels", "segments") if getattr(feature, w)]
-    if len(ways) != 1:
+def _one_form(feature: Feature, name: str, which: str) -> None:
+    forms = [w for w in ("markers", "points", "pixels", "segments") if getattr(feature, w)]
+    if len(forms) != 1:
         raise RefusalError(
             "FEATURE_UNCLEAR",
-            f"{name}: its {which} feature is given by {' and '.join(ways) or 'nothing'}; give one of markers, points, "
+            f"{name}: its {which} feature is given by {' and '.join(forms) or 'nothing'}; give one of markers, points, "
             "pixels",
         )
 
 
 def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> list[int]:
     """Indices of the markers that span the moving feature."""
-    _one_way(feature, name, "moving")
+    _one_form(feature, name, "moving")
     if not feature.markers:
         raise RefusalError("FEATURE_UNCLEAR", f"{name}: what moves is given by markers of the body")
     own = [marker_index(marker, place.arrays) for marker in feature.markers]
@@ -150,7 +150,7 @@ def _moving(feature: Feature, dimension: int, name: str, place: BodyState) -> li
 
 def _fixed(feature: Feature, dimension: int, name: str, place: BodyState, model_epoch: int | None) -> FloatArray:
     """The fixed feature (3, 4): a point of height 1, then its directions of height 0."""
-    _one_way(feature, name, "fixed")
+    _one_form(feature, name, "fixed")
     if feature.markers:
         raise RefusalError(
             "FEATURE_UNCLEAR", f"{name}: markers move with the body; what stands is given by points or pixels"

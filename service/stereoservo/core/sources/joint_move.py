@@ -23,11 +23,11 @@ ARRIVED_STEPS = 5
 
 def joint_goal(goal: Goal, target: JointTarget, context: StepContext) -> JointMove:
     """The move to ``target``. Raises RefusalError for unknown joints and positions beyond limits."""
-    wanted = context.q.copy()
+    goal_q = context.q.copy()
     for name, position in target.positions.items():
-        wanted[joint_index(name, context.settings)] = position
-    _inside_limits(wanted, context)
-    move = joint_move_to(goal.id, wanted, goal.speed_scale, context, goal.time_limit_s, goal.lease_s)
+        goal_q[joint_index(name, context.settings)] = position
+    _inside_limits(goal_q, context)
+    move = joint_move_to(goal.id, goal_q, goal.speed_scale, context, goal.time_limit_s, goal.lease_s)
     move.acknowledge_s = goal.acknowledge_s
     return move
 
@@ -82,8 +82,8 @@ def joint_report(move: JointMove, context: StepContext) -> PlanReport:
         if share is not None:
             raise RefusalError(
                 "KEEP_OUT",
-                f"the straight way in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a goal "
-                "beside it",
+                f"the straight path in joint space meets keep-out {name!r} at {100.0 * share:.0f} % of it: go by a "
+                "goal beside it",
                 subject=name,
                 value=share,
                 threshold=1.0,
@@ -117,12 +117,12 @@ def first_inside(box: FloatArray, margin: float, start: FloatArray, target: Floa
     enters, leaves = 0.0, 1.0
     for j in range(start.size):
         low, high = box[j, 0] - margin, box[j, 1] + margin
-        way = float(target[j] - start[j])
-        if way == 0.0:
+        travel = float(target[j] - start[j])
+        if travel == 0.0:
             if not low <= start[j] <= high:
                 return None
             continue
-        first, second = sorted(((low - start[j]) / way, (high - start[j]) / way))
+        first, second = sorted(((low - start[j]) / travel, (high - start[j]) / travel))
         enters, leaves = max(enters, float(first)), min(leaves, float(second))
     return enters if 0.0 < enters <= leaves else None
 
@@ -138,11 +138,11 @@ def _seconds(move: JointMove, limits: LimitSettings, start: FloatArray) -> float
 def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
     limits = context.settings.limits
     low, high = limits.position_min + limits.position_margin, limits.position_max - limits.position_margin
-    rooms = np.minimum(move.target - low, high - move.target)
-    start_rooms = np.minimum(context.q - low, high - context.q)
-    at_end = bool(rooms.min() <= start_rooms.min())
-    rooms = rooms if at_end else start_rooms
-    joint = int(rooms.argmin())
+    clearances = np.minimum(move.target - low, high - move.target)
+    start_clearances = np.minimum(context.q - low, high - context.q)
+    at_end = bool(clearances.min() <= start_clearances.min())
+    clearances = clearances if at_end else start_clearances
+    joint = int(clearances.argmin())
     value = float((move.target if at_end else context.q)[joint])
     upper = high[joint] - value < value - low[joint]
     return Approach(
@@ -150,7 +150,7 @@ def _nearest_limit(move: JointMove, context: StepContext) -> Approach:
         context.settings.joint_names[joint],
         value,
         float((high if upper else low)[joint]),
-        float(rooms[joint]),
+        float(clearances[joint]),
         "rad or m",
         1.0 if at_end else 0.0,
     )
@@ -185,7 +185,7 @@ def joints_ahead(context: StepContext) -> FloatArray:
     if not delays.delay_s.any():
         return context.q
     lost = np.abs(block.friction) * delays.delay_s if context.state.friction_of else 0.0
-    return context.q + delays.under_way - np.clip(delays.under_way, -lost, lost)
+    return context.q + delays.in_transit - np.clip(delays.in_transit, -lost, lost)
 
 
 def arrived(q: FloatArray, target: FloatArray, settings: CoreSettings) -> bool:

@@ -44,14 +44,14 @@ from stereoservo.core.sources.progress import (
 )
 from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal
-from stereoservo.core.target.follow import Follower, follow_target, stands, start_following
+from stereoservo.core.target.follow import Follower, follow_target, is_static, start_following
 from stereoservo.kinematics.kernels import project_points, transform_points
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
 from stereoservo.planning.tracking import advance, planned_joints, sample_plan
 
-AIM = ("used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target")
+GOAL_ARRAYS = ("used", "wanted", "set_points", "target_points", "centre_weights", "centre_body", "centre_target")
 """Arrays of a goal that are copied to the workspace for a law's kernel."""
 SELF_MOTION_RATE = 0.5
 """Rate [1/s], relative to a joint's half range, at which self-motion moves a joint away from a limit."""
@@ -67,7 +67,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     in the workspace.
     """
     law = context.derived.laws[source.law]
-    if by_kernel(source, law) and context.weights is context.derived.room.weights:
+    if by_kernel(source, law) and context.weights is context.derived.workspace.weights:
         return _kernel_step(source, context)  # the estimate changes if a camera's pose is found
     waiting = wait_for_target(source, context)
     if waiting is not None:
@@ -87,7 +87,7 @@ def servo_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
         scene = scene._replace(camera_centres=arrays.camera_centres)
     if law.planned:
         if source.plan is None and source.pose_known:
-            hint = "the way is planned from where the arm comes to rest"
+            hint = "the path is planned from where the arm comes to rest"
             waits = Reason("PLANNING", "slow", hint=hint)
             return SourceOutput(np.zeros_like(context.q), error_px=error_px, reasons=(waits,))
         if source.plan is not None:
@@ -119,19 +119,19 @@ def wait_for_target(source: Follower, context: StepContext) -> SourceOutput | No
 
 def may_end(source: Follower, context: StepContext) -> bool:
     """Whether a goal may be reached for good: it follows no target, or its target is static."""
-    return source.followed is None or stands(context.state.target)
+    return source.followed is None or is_static(context.state.target)
 
 
 def _kernel_step(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     """`servo_step` by the kernel of a law; returns None while the goal is active, with its velocity in
     the workspace.
     """
-    room = context.derived.room
-    work = room.numbers
+    workspace = context.derived.workspace
+    work = workspace.numbers
     if not work.followed:  # the goal has just started, or the state was examined before
-        aim_at(room, source)
-        follow_goal(context.state.block.record, room.record)
-    found = Found(work.run_found, error_now(room), work.seen, work.markers_needed)
+        set_goal(workspace, source)
+        follow_goal(context.state.block.record, workspace.record)
+    found = Found(work.run_found, error_now(workspace), work.seen, work.markers_needed)
     ended = _ended(source, context, found, source.wanted)
     return drive(source, context) if ended is None else ended
 
@@ -140,37 +140,37 @@ def drive(source: ServoGoal, context: StepContext) -> SourceOutput | None:
     """Write the velocity of an active goal into the workspace by its law's kernel; returns None unless the kernel
     fails.
     """
-    room, law = context.derived.room, context.derived.laws[source.law]
+    workspace, law = context.derived.workspace, context.derived.laws[source.law]
     if law.components:
         show_face(source, context)
     assert law.kernel is not None
     try:
-        law.kernel(room.record)
+        law.kernel(workspace.record)
     except Exception as error:  # as for any law: the exception ends its goal, never the loop
-        return _law_failed(source, context, error_now(room), error)
+        return _law_failed(source, context, error_now(workspace), error)
     if source.damping != 0.0:
-        room.velocity[:] = damp(source, context, room.velocity)
-    if room.velocity.size > RIGID_FREEDOMS:
-        room.velocity += away_from_limits(context)
+        workspace.velocity[:] = damp(source, context, workspace.velocity)
+    if workspace.velocity.size > RIGID_FREEDOMS:
+        workspace.velocity += away_from_limits(context)
     return None
 
 
-def error_now(room: Workspace) -> float | None:
+def error_now(workspace: Workspace) -> float | None:
     """The error [px] of the goal in the workspace; None if none is measured."""
-    return room.numbers.error_px if room.numbers.measured else None
+    return workspace.numbers.error_px if workspace.numbers.measured else None
 
 
 def found_by_kernel(source: ServoGoal, context: StepContext) -> SourceOutput:
     """The output of the goal's law kernel in this step."""
-    room, law = context.derived.room, context.derived.laws[source.law]
-    step = _found_step(room, len(law.components))
+    workspace, law = context.derived.workspace, context.derived.laws[source.law]
+    step = _found_step(workspace, len(law.components))
     return SourceOutput(
         step.velocity,
         True,
         source.goal.speed_scale,
         False,
         False,
-        error_now(room),
+        error_now(workspace),
         step.error,
         law.reasons(step),
     )
@@ -185,22 +185,22 @@ def damp(source: LawRun, context: StepContext, velocity: FloatArray, expected: F
     return damped_velocity(velocity, expected, context.state.block.velocities, source.damping)
 
 
-def aim_at(room: Workspace, goal: ServoGoal) -> None:
+def set_goal(workspace: Workspace, goal: ServoGoal) -> None:
     """Copy a ``goal`` to the workspace for the law. A moving goal replaces its arrays and never writes into them, so
     they are compared by identity.
     """
-    aim = (
+    loaded = (
         goal.used, goal.wanted, goal.set_points, goal.target_points, goal.centre_weights, goal.centre_body,
         goal.centre_target, goal.pose_known, goal.gain_near, goal.gain_far, goal.gain_slope, goal.tolerance_px,
         goal.hold_frames, goal.time_limit_s, goal.jacobian,
     )  # fmt: skip
-    if len(room.aim) == len(aim) and all(map(is_, aim, room.aim)):
+    if len(workspace.loaded) == len(loaded) and all(map(is_, loaded, workspace.loaded)):
         return
-    room.aim, room.faced, given = aim, None, room.arrays
-    for name in AIM:
+    workspace.loaded, workspace.faced, given = loaded, None, workspace.arrays
+    for name in GOAL_ARRAYS:
         given[name][:] = getattr(goal, name)
     given["target_known"][:] = goal.pose_known
-    numbers = room.numbers
+    numbers = workspace.numbers
     numbers.gain_near, numbers.gain_far, numbers.gain_slope = goal.gain_near, goal.gain_far, goal.gain_slope
     numbers.tolerance_px, numbers.time_limit_s = goal.tolerance_px, goal.time_limit_s
     numbers.hold_frames, numbers.markers_needed = goal.hold_frames, markers_needed(goal.wanted)
@@ -211,32 +211,32 @@ def show_face(goal: ServoGoal, context: StepContext) -> None:
     """Write the face that a law with components uses for a ``goal`` into the workspace; new images may select another
     face.
     """
-    room = context.derived.room
-    if goal.pose_known and (room.numbers.frames_passed or goal.choice.cameras == 0):
-        scene, task = choose(goal, context, room.scene, room.task)
-        _face(room, task.face, scene.camera_centres)
-    elif room.faced is not goal.choice:
-        eyes = law_scene(room.scene, goal.choice).camera_centres
-        _face(room, goal.choice.triple, eyes, goal.choice)
+    workspace = context.derived.workspace
+    if goal.pose_known and (workspace.numbers.frames_passed or goal.choice.cameras == 0):
+        scene, task = choose(goal, context, workspace.scene, workspace.task)
+        _face(workspace, task.face, scene.camera_centres)
+    elif workspace.faced is not goal.choice:
+        centres = law_scene(workspace.scene, goal.choice).camera_centres
+        _face(workspace, goal.choice.triple, centres, goal.choice)
 
 
-def _face(room: Workspace, triple: IntArray, eyes: FloatArray, choice: FaceChoice | None = None) -> None:
+def _face(workspace: Workspace, triple: IntArray, centres: FloatArray, choice: FaceChoice | None = None) -> None:
     """Write the face to the workspace: three markers (3,), and the centres (k, 4) of the cameras that see it, as in the
     ``choice``.
     """
-    room.faced, given = choice, room.arrays
-    given["face"][:], given["eyes"][: len(eyes)] = triple, eyes
-    room.numbers.eye_count = len(eyes)
+    workspace.faced, given = choice, workspace.arrays
+    given["face"][:], given["eyes"][: len(centres)] = triple, centres
+    workspace.numbers.viewing_count = len(centres)
 
 
-def _found_step(room: Workspace, components: int) -> LawStep:
+def _found_step(workspace: Workspace, components: int) -> LawStep:
     """The result of the law's kernel, with so many components."""
-    given, velocity = room.arrays, room.velocity.copy()
+    given, velocity = workspace.arrays, workspace.velocity.copy()
     if components == 0:
-        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, room.numbers.conditioning)
+        return LawStep(velocity, NO_COMPONENTS, NO_COMPONENTS, NO_STATUS, workspace.numbers.conditioning)
     found = given["components"].reshape(-1)[: 2 * components].reshape(2, -1).copy()
     status = given["component_status"][:components].copy()
-    return LawStep(velocity, found[0], found[1], status, room.numbers.conditioning)
+    return LawStep(velocity, found[0], found[1], status, workspace.numbers.conditioning)
 
 
 class GoalError(NamedTuple):
@@ -261,26 +261,24 @@ def goal_error(
 ) -> GoalError:
     """Error and body of ``source`` with the current ``weights`` (c, m) and ``pixels`` (c, m, 2)."""
     usable = np.empty(weights.shape)
-    aim = Aim(source.used, source.wanted, source.set_points)
-    measured, error_px, seen = _measure(weights, pixels, aim, usable)
+    goal = SetPoints(source.used, source.wanted, source.set_points)
+    measured, error_px, seen = _measure(weights, pixels, goal, usable)
     joints = context.q + context.state.block.correction
     points: FloatArray = body_points(arm_in(arrays), joints)
     centre = centre_of(source, joints, arrays, points)
     return GoalError(usable, error_px if measured else None, seen, points, centre)
 
 
-class Aim(NamedTuple):
-    """Set-points of a goal: cameras ``used`` (c,), and ``set_points`` (c, m, 2), which count where ``wanted`` (c, m) >
-    0.
-    """
+class SetPoints(NamedTuple):
+    """Set-points of a goal: cameras ``used`` (c,); ``set_points`` (c, m, 2), used where ``required`` (c, m) > 0."""
 
     used: FloatArray
-    wanted: FloatArray
+    required: FloatArray
     set_points: FloatArray
 
 
 @kernel
-def _measure(weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArray) -> tuple[bool, float, int]:
+def _measure(weights: FloatArray, pixels: FloatArray, goal: SetPoints, usable: FloatArray) -> tuple[bool, float, int]:
     """Returns whether an error was measured, the largest distance [px] over markers and cameras, and how many markers
     are seen; writes the weights of the usable cameras to ``usable`` (c, m).
     """
@@ -289,11 +287,11 @@ def _measure(weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArr
     for i in range(markers):
         visible = False
         for c in range(cameras):
-            usable[c, i] = weights[c, i] * aim.used[c]
-            if not usable[c, i] * aim.wanted[c, i] > 0.0:
+            usable[c, i] = weights[c, i] * goal.used[c]
+            if not usable[c, i] * goal.required[c, i] > 0.0:
                 continue
             visible = True
-            u, v = pixels[c, i, 0] - aim.set_points[c, i, 0], pixels[c, i, 1] - aim.set_points[c, i, 1]
+            u, v = pixels[c, i, 0] - goal.set_points[c, i, 0], pixels[c, i, 1] - goal.set_points[c, i, 1]
             distance = math.sqrt(u * u + v * v)
             if distance > largest or math.isnan(distance):
                 largest = distance
@@ -303,21 +301,21 @@ def _measure(weights: FloatArray, pixels: FloatArray, aim: Aim, usable: FloatArr
 
 
 @kernel
-def follow_goal(block: Record, room: Record) -> bool:
-    """Measure the progress of the goal in the workspace ``room``, as the last part of the observation; returns whether
+def follow_goal(block: Record, workspace: Record) -> bool:
+    """Measure the progress of the goal in the ``workspace``, as the last part of the observation; returns whether
     the goal stays active. Writes its error and body, as in `GoalError`, the gain, and the result of `account_run`.
     """
-    memory, work = block[0], room[0]
+    memory, work = block[0], workspace[0]
     n, c, m = work.joints, work.cameras, work.markers
-    aim = Aim(work.used[:c], work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2)))
+    required, set_points = work.wanted[: c * m].reshape((c, m)), work.set_points[: 2 * c * m].reshape((c, m, 2))
     measured, error_px, work.seen = _measure(
         work.weights[: c * m].reshape((c, m)),
         work.pixels[: 2 * c * m].reshape((c, m, 2)),
-        aim,
+        SetPoints(work.used[:c], required, set_points),
         work.usable[: c * m].reshape((c, m)),
     )
     work.measured, work.error_px = int(measured), error_px
-    arm, points = arm_of(room), work.body[: 4 * m].reshape((m, 4))
+    arm, points = arm_of(workspace), work.body[: 4 * m].reshape((m, 4))
     joints = work.q[:n] + memory.correction[:n]
     points[:] = body_points(arm, joints)
     centre_into(arm, joints, points, Centre(work.centre_weights[:m], work.centre_body), work.centre)
@@ -356,17 +354,17 @@ def run_ended(
     context: StepContext,
     error_px: float | None,
     seen: int,
-    wanted: FloatArray | None = None,
+    required: FloatArray | None = None,
     *,
     may_end: bool = True,
 ) -> SourceOutput | None:
     """The output of a law's step that is out of time, sees too few markers, or has reached the goal; None if the goal
     stays active.
 
-    ``seen``: number of the goal's markers that are seen, of those ``wanted`` (c, m); None: more than are needed.
+    ``seen``: number of the goal's markers that are seen, of those ``required`` (c, m); None: more than are needed.
     ``may_end``: False for a goal that still moves.
     """
-    needed = MIN_MARKERS if seen >= MIN_MARKERS or wanted is None else markers_needed(wanted)
+    needed = MIN_MARKERS if seen >= MIN_MARKERS or required is None else markers_needed(required)
     terms = RunTerms(source.tolerance_px, source.hold_frames, source.time_limit_s)
     found = account_run(
         context.state.block.record,
@@ -376,7 +374,7 @@ def run_ended(
         context.dt_s,
         terms,
     )
-    return _ended(source, context, Found(found, error_px, seen, needed), wanted, may_end=may_end)
+    return _ended(source, context, Found(found, error_px, seen, needed), required, may_end=may_end)
 
 
 class Found(NamedTuple):
@@ -391,7 +389,7 @@ class Found(NamedTuple):
 
 
 def _ended(
-    source: LawRun, context: StepContext, found: Found, wanted: FloatArray | None, *, may_end: bool = True
+    source: LawRun, context: StepContext, found: Found, required: FloatArray | None, *, may_end: bool = True
 ) -> SourceOutput | None:
     """The output of a step that is out of time, sees too few markers, or has reached the goal; None if
     it stays active.
@@ -413,7 +411,7 @@ def _ended(
     if run == SETTLED and may_end:
         frames = context.state.block.numbers.run.last_frames
         if source.apart_frames != frames:
-            source.apart, source.apart_frames = disagreement(source, context, wanted), frames
+            source.apart, source.apart_frames = disagreement(source, context, required), frames
         if source.apart is not None:
             return SourceOutput(
                 np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(source.apart,)
@@ -454,7 +452,7 @@ def choose(source: ServoGoal, context: StepContext, scene: Scene, task: Task) ->
     if not source.pose_known:
         return scene, task
     before = source.choice
-    if before.cameras > 0 and not context.derived.room.numbers.frames_passed:  # no frame has arrived since
+    if before.cameras > 0 and not context.derived.workspace.numbers.frames_passed:  # no frame has arrived since
         return law_scene(scene, before), task
     choice = choose_face(source.faces, scene, task, before)
     if choice.cameras == 0:  # no camera sees three markers of one face: keep the previous face
@@ -576,20 +574,20 @@ def trajectory_task(source: ServoGoal, context: StepContext, scene: Scene, task:
     plan = source.plan
     assert plan is not None
     if source.plan_s > 0.0:  # cycles that the loop missed: the arm continued at its last velocity
-        missed = round(context.derived.room.numbers.elapsed_s / context.dt_s) - 1
+        missed = round(context.derived.workspace.numbers.elapsed_s / context.dt_s) - 1
         source.plan_s = min(max(0.0, source.plan_s + missed * context.dt_s), float(plan.times[-1]))
     begin_s = source.plan_s
     set_points, share = _planned_set_points(source, scene)
-    wanted = np.ones_like(source.wanted) if share < 1.0 else source.wanted
-    apart = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
-    lag = float(np.where(scene.weights * wanted > 0.0, apart, 0.0).max()) / LARGEST_LAG_PX
+    required = np.ones_like(source.wanted) if share < 1.0 else source.wanted
+    distances = np.sqrt(((set_points - scene.pixels) ** 2).sum(axis=-1))
+    lag = float(np.where(scene.weights * required > 0.0, distances, 0.0).max()) / LARGEST_LAG_PX
     source.plan_s = advance(plan, source.plan_s, context.dt_s, lag)
     # Displacement of the set-points in the next step: its mean rate is feasible for a velocity held for a step.
     ahead, _ = _planned_set_points(source, scene)
     joints = planned_joints(plan, begin_s, source.plan_s, context.dt_s, context.q)
     return task._replace(
         set_points=set_points,
-        wanted=wanted,
+        wanted=required,
         rates=(ahead - set_points) / context.dt_s,
         joint_rates=joints.rates,
         joint_error=joints.error,
@@ -654,7 +652,7 @@ def examine_run(source: LawRun, context: StepContext, earlier: tuple[Reason, ...
 def _servo_traits(source: ServoGoal, context: StepContext) -> Traits:
     local = source.law if context.derived.laws[source.law].path == "free" else ""
     return _plain_traits(source, context)._replace(
-        wanted=source.wanted, moves=source.stream is not None or source.followed is not None, local_law=local
+        required=source.wanted, moves=source.stream is not None or source.followed is not None, local_law=local
     )
 
 

@@ -176,7 +176,7 @@ class Traits(NamedTuple):
 
     gain: float
     left_s: float
-    wanted: FloatArray | None = None
+    required: FloatArray | None = None
     moves: bool = False
     local_law: str = ""
 
@@ -200,9 +200,9 @@ def _near_limits(context: StepContext) -> list[Reason]:
     for j, name in enumerate(context.settings.joint_names):
         for bound, side in ((limits.position_max[j], 1.0), (limits.position_min[j], -1.0)):
             limit = float(bound) - side * limits.position_margin
-            room = side * (limit - float(context.q[j]))
-            if room < NEAR_LIMIT and side * moving[j] > 0.0:
-                hint = f"joint {name} is {max(room, 0.0):.3f} from its limit less the margin, and moves towards it"
+            clearance = side * (limit - float(context.q[j]))
+            if clearance < NEAR_LIMIT and side * moving[j] > 0.0:
+                hint = f"joint {name} is {max(clearance, 0.0):.3f} from its limit less the margin, and moves towards it"
                 found.append(Reason("NEAR_LIMIT", "info", name, float(context.q[j]), limit, "rad or m", hint))
     return found
 
@@ -237,8 +237,8 @@ def _few_markers(source: LawRun, context: StepContext, traits: Traits) -> list[R
     if context.weights is None:
         return []
     usable = context.weights * source.used[:, None]
-    if traits.wanted is not None:
-        usable = usable * traits.wanted
+    if traits.required is not None:
+        usable = usable * traits.required
     seen = int((usable.max(axis=0) > 0.0).sum())
     if seen >= FEW_MARKERS:
         return []
@@ -326,10 +326,10 @@ AGREED, DOUBTFUL, UNDECIDED, DISPLACED = range(4)
 def forget_frames(block: Record) -> None:
     """Reset the means."""
     memory = block[0]
-    sights = memory.cameras * memory.markers
-    memory.settled_innovation[: 2 * sights] = 0.0
-    memory.settled_variance[:sights] = 0.0
-    memory.settled_count[:sights] = 0.0
+    observed = memory.cameras * memory.markers
+    memory.settled_innovation[: 2 * observed] = 0.0
+    memory.settled_variance[:observed] = 0.0
+    memory.settled_count[:observed] = 0.0
     memory.settled_ns[: memory.cameras] = 0
 
 
@@ -344,13 +344,13 @@ def take_frames(block: Record) -> None:
             continue
         memory.settled_ns[c] = t_ns
         for i in range(m):
-            sight, row = c * m + i, c * rows + i
-            if memory.seen_ns[sight] != t_ns:
+            cell, row = c * m + i, c * rows + i
+            if memory.seen_ns[cell] != t_ns:
                 continue
             for a in range(2):
-                memory.settled_innovation[2 * sight + a] += memory.frame_innovation[2 * row + a]
-            memory.settled_variance[sight] += 0.5 * (memory.frame_spread[4 * row] + memory.frame_spread[4 * row + 3])
-            memory.settled_count[sight] += 1.0
+                memory.settled_innovation[2 * cell + a] += memory.frame_innovation[2 * row + a]
+            memory.settled_variance[cell] += 0.5 * (memory.frame_spread[4 * row] + memory.frame_spread[4 * row + 3])
+            memory.settled_count[cell] += 1.0
 
 
 # -- the accuracy of the model ------------------------------------------------------------------------------
@@ -405,19 +405,19 @@ def pixel_slopes(
     q: FloatArray,
     marker_points: FloatArray,
     cameras: tuple[FloatArray, FloatArray],
-    sights_of: tuple[IntArray, IntArray],
+    observed_of: tuple[IntArray, IntArray],
 ) -> FloatArray:
     """Derivatives (2 k, p) of the innovations of k observations, in ideal pixels, by the ``parameters`` of a model,
     with the joints at ``q`` (n,).
 
     ``chain``: generators (n, 4, 4), kinds, zeros, and whether the tip comes first.
     ``cameras``: matrices (c, 3, 4) and lenses.
-    ``sights_of``: the camera and the marker of each observation, (k,) each.
+    ``observed_of``: the camera and the marker of each observation, (k,) each.
     """
-    (matrices, lenses), (camera_of, marker_of) = cameras, sights_of
+    (matrices, lenses), (camera_of, marker_of) = cameras, observed_of
     directions, part, index, covariance = parameters
     generators, kinds, zero, tip_first = chain
-    n, sights = q.size, camera_of.size
+    n, observed = q.size, camera_of.size
     motions = np.empty((n, 4, 4))
     for j in range(n):
         _motion(generators[j], kinds[j] == 1, q[j] - zero[j], motions[j])
@@ -430,7 +430,7 @@ def pixel_slopes(
         multiply4_into(motions[n - 1 - k if tip_first else k], after[k + 1], after[k])
     H = before[n]
     points = transform_points(H, marker_points)
-    slopes = np.zeros((2 * sights, part.size))
+    slopes = np.zeros((2 * observed, part.size))
     first, second, third = np.empty((4, 4)), np.empty((4, 4)), np.empty((4, 4))
     for p in range(part.size):
         at, D = index[p], directions[p].reshape((4, 4))
@@ -440,7 +440,7 @@ def pixel_slopes(
             multiply4_into(motions[at], D, second)
             multiply4_into(before[k], first - second, third)
             multiply4_into(third, after[k + 1], first)
-        for s in range(sights):
+        for s in range(observed):
             c, i = camera_of[s], marker_of[s]
             if ((part[p] == MATRIX or part[p] == LENS) and c != at) or (part[p] == POINT and i != at):
                 continue
@@ -619,9 +619,9 @@ def decide(
 # -- where a goal ends --------------------------------------------------------------------------------------
 
 
-def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None) -> Reason | None:
+def disagreement(source: LawRun, context: StepContext, required: FloatArray | None) -> Reason | None:
     """The reason why a goal whose error is inside its tolerance is not reached: a camera that it uses, with set-points
-    ``wanted`` (c, m) in it (None: in all), disagrees with the other cameras and the joints; None if they agree.
+    ``required`` (c, m) in it (None: in all), disagrees with the other cameras and the joints; None if they agree.
 
     Not tested: models that state no covariance, cameras that may move, and bodies that move independently of the arm.
     """
@@ -631,15 +631,15 @@ def disagreement(source: LawRun, context: StepContext, wanted: FloatArray | None
     parameters = _parameters(context, model)
     if parameters is None:
         return None
-    sights = _chosen(state.block.settled_count)
-    begins = np.searchsorted(sights[:, 0], np.arange(len(arrays.matrices) + 1)) * 2
+    observed = _chosen(state.block.settled_count)
+    begins = np.searchsorted(observed[:, 0], np.arange(len(arrays.matrices) + 1)) * 2
     if int((np.diff(begins) >= 2 * FEWEST).sum()) < 2:
         return None
-    moment = _moment(context, arrays, parameters, sights)
+    snapshot = _snapshot(context, arrays, parameters, observed)
     gains, effects = np.zeros(len(arrays.matrices) + 1), np.zeros(len(arrays.matrices))
-    if not compare_causes(*moment, begins, (gains, effects)):
+    if not compare_causes(*snapshot, begins, (gains, effects)):
         return None
-    judged = source.used if wanted is None else source.used * (wanted > 0.0).any(axis=1)
+    judged = source.used if required is None else source.used * (required > 0.0).any(axis=1)
     limit_px = SHARE * source.tolerance_px
     may_wait = float(state.block.settled_count.max()) < MOST_FRAMES
     found, cameras = decide(gains, effects, int(begins[-1]), len(context.q), limit_px, judged, may_wait=may_wait)
@@ -669,14 +669,14 @@ def _chosen(count: FloatArray) -> IntArray:
     return np.argwhere(chosen)
 
 
-def _moment(
-    context: StepContext, arrays: ModelArrays, parameters: ModelParameters, sights: IntArray
+def _snapshot(
+    context: StepContext, arrays: ModelArrays, parameters: ModelParameters, observed: IntArray
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """For the observations ``sights`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), and the derivatives
-    of the pixels by a displacement of the camera (2 k, 6) and by the joints (2 k, n).
+    """For the observations ``observed`` (k, 2): mean innovations (2 k,), their covariance (2 k, 2 k), and the
+    derivatives of the pixels by a displacement of the camera (2 k, 6) and by the joints (2 k, n).
     """
     block, q = context.state.block, context.q
-    cameras, markers = np.ascontiguousarray(sights[:, 0]), np.ascontiguousarray(sights[:, 1])
+    cameras, markers = np.ascontiguousarray(observed[:, 0]), np.ascontiguousarray(observed[:, 1])
     given = (parameters.part != POINT) | np.isin(parameters.index, markers)
     directions, part, index = parameters.directions[given], parameters.part[given], parameters.index[given]
     covariance = np.ascontiguousarray(parameters.covariance[np.ix_(given, given)])
@@ -713,8 +713,8 @@ def _affine_motions(
     """
     images = np.einsum("kij,kj->ki", matrices[cameras], points[markers])
     places = images[:, :2] / images[:, 2:]
-    middle, size = places.mean(axis=0), max(float(places.std()), 1.0)
-    columns = np.concatenate([np.ones((len(places), 1)), (places - middle) / size], axis=1)
+    centroid, size = places.mean(axis=0), max(float(places.std()), 1.0)
+    columns = np.concatenate([np.ones((len(places), 1)), (places - centroid) / size], axis=1)
     motions = np.zeros((len(d), FREEDOMS))
     motions[0::2, :3], motions[1::2, 3:] = columns, columns
     return motions

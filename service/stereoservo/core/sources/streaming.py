@@ -12,7 +12,7 @@ from math import isfinite
 
 import numpy as np
 
-from stereoservo.control.faces import spread_in_images
+from stereoservo.control.faces import spaced_in_images
 from stereoservo.control.filters import (
     ClientClock,
     arrived,
@@ -58,14 +58,14 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
         able = [repr(name) for name in LAWS.surest_first() if LAWS[name].follows_streams]
         raise RefusalError(
             "LAW_CANNOT_FOLLOW",
-            f"law {source.law!r} follows a way that was planned for a goal that stands; stream with "
+            f"law {source.law!r} follows a path that was planned for a static goal; stream with "
             f"{', '.join(able[:-1])} or {able[-1]}",
             subject=source.law,
         )
     of_this_model(command.target.model_epoch, epoch)
-    set_points, wanted = _set_points(command.target, place)
-    wanted = wanted * source.wanted  # the set-points that count do not change
-    shown = int((wanted.max(axis=0) > 0.0).sum())
+    set_points, required = _set_points(command.target, place)
+    required = required * source.wanted  # the set-points that count do not change
+    shown = int((required.max(axis=0) > 0.0).sum())
     if shown < MIN_MARKERS:
         raise RefusalError(
             "TOO_FEW_MARKERS",
@@ -81,14 +81,14 @@ def update(command: UpdateGoal, source: ServoGoal, context: StepContext, place: 
         source.set_points,
     )
     stamp_s = _stamp(command, stream, context)
-    _no_jump(source, set_points, wanted, context)
+    _no_jump(source, set_points, required, context)
     if source.pose_known:
-        _one_body(source, place, set_points, wanted)
+        _one_body(source, place, set_points, required)
     source.stream = Stream(
-        observe(stream.track, stamp_s, set_points, wanted),
+        observe(stream.track, stamp_s, set_points, required),
         arrived(stream.clock, stamp_s, context.now_ns * 1e-9),
         context.now_ns,
-        np.where(wanted[..., None] > 0.0, set_points, source.set_points),
+        np.where(required[..., None] > 0.0, set_points, source.set_points),
     )
     source.renew_lease(context.now_ns)
     return "moved"
@@ -120,8 +120,8 @@ def _stamp(command: UpdateGoal, stream: Stream, context: StepContext) -> float:
     return command.stamp_s
 
 
-def _no_jump(source: ServoGoal, set_points: FloatArray, wanted: FloatArray, context: StepContext) -> None:
-    distance = np.where(wanted > 0.0, np.sqrt(((set_points - source.set_points) ** 2).sum(axis=-1)), 0.0)
+def _no_jump(source: ServoGoal, set_points: FloatArray, required: FloatArray, context: StepContext) -> None:
+    distance = np.where(required > 0.0, np.sqrt(((set_points - source.set_points) ** 2).sum(axis=-1)), 0.0)
     camera = int(distance.max(axis=-1).argmax())
     limit = JUMP_SHARE * context.settings.cameras[camera].width
     largest = float(distance[camera].max())
@@ -139,15 +139,15 @@ def _no_jump(source: ServoGoal, set_points: FloatArray, wanted: FloatArray, cont
         )
 
 
-def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, wanted: FloatArray) -> None:
+def _one_body(source: ServoGoal, place: BodyState, set_points: FloatArray, required: FloatArray) -> None:
     arrays, points, displacement = place.arrays, source.target_points, _identity()
     basis, rounds = displacement_basis(arrays, place.operators), REFINEMENTS
-    if arrays.sights > PIXELS_AT_ONCE:
-        few = spread_in_images(np.flatnonzero(wanted.max(axis=0) > 0.0), set_points, wanted, FEW)
-        some = np.ascontiguousarray(set_points[:, few]), np.ascontiguousarray(wanted[:, few])
+    if arrays.observation_count > PIXELS_AT_ONCE:
+        few = spaced_in_images(np.flatnonzero(required.max(axis=0) > 0.0), set_points, required, FEW)
+        some = np.ascontiguousarray(set_points[:, few]), np.ascontiguousarray(required[:, few])
         displacement = refined_pose(arrays, basis, points[few], displacement, *some)[0].displacement
         rounds = 1
-    pose, _ = refined_pose(arrays, basis, points, displacement, set_points, wanted, rounds)
+    pose, _ = refined_pose(arrays, basis, points, displacement, set_points, required, rounds)
     if not pose.worst_px <= MAX_GOAL_RESIDUAL_PX:
         raise RefusalError(
             "NOT_RIGID",
@@ -182,7 +182,7 @@ def follow(source: ServoGoal, context: StepContext, arrays: ModelArrays) -> bool
             _identity(),
             source.set_points,
             given,
-            1 if arrays.sights > PIXELS_AT_ONCE else FOLLOWING_REFINEMENTS,
+            1 if arrays.observation_count > PIXELS_AT_ONCE else FOLLOWING_REFINEMENTS,
         )
         source.target_points = pose.points
         source.centre_target = transform_points(pose.displacement, source.centre_target[None])[0]

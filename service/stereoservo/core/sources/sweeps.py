@@ -20,15 +20,15 @@ from stereoservo.core.rest_averages import marker_rows
 from stereoservo.core.settings import LARGEST_RANGE, CoreSettings, TrialSettings
 from stereoservo.core.sources.calibration import (
     BRAKING,
+    driven_path,
     enough_inside,
     finish,
     image_motion,
     inside_by_margin,
     marker_pixels,
     record_joints,
-    room,
+    span,
     start_trials,
-    taken_path,
     too_little,
 )
 from stereoservo.core.sources.joint_move import approach_velocity, arrived, joints_ahead
@@ -226,7 +226,7 @@ def _send(sweeps: SweepMotion, context: StepContext) -> None:
             id=sweeps.id,
             trial=sweeps.trial,
             progress=min(1.0, done),
-            path=taken_path(sweeps, sweeps.leg),
+            path=driven_path(sweeps, sweeps.leg),
         )
 
 
@@ -365,7 +365,8 @@ def _alone(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -
     """Target (n,) of a joint's outward sweep; None if limits or keep-outs leave no range."""
     joint = sweeps.joint
     offset = min(
-        _range(joint, context, settings), float(room(joint, context.settings, settings)[0 if sweeps.side > 0 else 1])
+        _range(joint, context, settings),
+        float(span(joint, context.settings, settings)[0 if sweeps.side > 0 else 1]),
     )
     target = settings.base.copy()
     target[joint] += sweeps.side * offset
@@ -407,7 +408,7 @@ def _combined(sweeps: SweepMotion, context: StepContext, settings: TrialSettings
 def _candidates(sweeps: SweepMotion, context: StepContext, settings: TrialSettings) -> FloatArray:
     """Random combinations (k, n) of offsets from the base within limits, more of them near the ends of the ranges."""
     n = sweeps.lowest.size
-    reach = np.array([np.minimum(room(j, context.settings, settings), _range(j, context, settings)) for j in range(n)])
+    reach = np.array([np.minimum(span(j, context.settings, settings), _range(j, context, settings)) for j in range(n)])
     drawn = np.random.default_rng([sweeps.corner, n]).uniform(-1.0, 1.0, (CANDIDATES, n))
     shares = np.sin(0.5 * np.pi * drawn)
     return np.asarray(np.where(shares > 0.0, shares * reach[:, 0], shares * reach[:, 1]))

@@ -48,7 +48,7 @@ def require_followable(goal: Goal, follows_streams: bool, law: str, pose_known: 
     if not follows_streams:
         raise RefusalError(
             "LAW_CANNOT_FOLLOW",
-            f"law {law!r} follows a way that was planned for a goal that stands",
+            f"law {law!r} follows a path that was planned for a static goal",
             subject=law,
         )
     if not pose_known:
@@ -98,25 +98,25 @@ def _stated(
     """
     ids = np.array(sorted(goal.follow_markers), dtype=np.int64)
     cameras = len(context.settings.cameras)
-    sights, seen = np.zeros((cameras, len(ids), 2)), np.zeros((cameras, len(ids)))
+    pixels, seen = np.zeros((cameras, len(ids), 2)), np.zeros((cameras, len(ids)))
     for name, markers in goal.follow_seen.items():
         c = camera_index(name, context.settings)
         for k, marker in enumerate(ids.tolist()):
             if marker in markers:
-                sights[c, k] = ideal_pixels(arrays.lenses[c], np.array([markers[marker]], dtype=np.float64))[0]
-                seen[c, k] = float(np.isfinite(sights[c, k]).all())
-    points, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
-    there = known > 0.0
-    if int(there.sum()) < FEWEST:
+                pixels[c, k] = ideal_pixels(arrays.lenses[c], np.array([markers[marker]], dtype=np.float64))[0]
+                seen[c, k] = float(np.isfinite(pixels[c, k]).all())
+    points, known = find_shape(arrays.matrices, pixels, seen, arrays.plane_at_infinity)
+    found = known > 0.0
+    if int(found.sum()) < FEWEST:
         raise RefusalError(
             "TOO_FEW_MARKERS",
-            f"{int(there.sum())} of the target's markers are shown by two cameras where the goal holds; at least "
+            f"{int(found.sum())} of the target's markers are shown by two cameras where the goal holds; at least "
             f"{FEWEST} are needed: teach it with the target in view",
-            value=float(there.sum()),
+            value=float(found.sum()),
             threshold=float(FEWEST),
             unit="markers",
         )
-    return ids[there], np.ascontiguousarray(points[there]), sights[:, there].copy(), seen[:, there].copy()
+    return ids[found], np.ascontiguousarray(points[found]), pixels[:, found].copy(), seen[:, found].copy()
 
 
 def start_following(source: Follower, context: StepContext) -> None:
@@ -129,9 +129,9 @@ def start_following(source: Follower, context: StepContext) -> None:
         if body is None or not body.carried:
             state.target = target_body(arrays.ids, arrays.marker_points, cameras, carried=True)
     elif goal.follow_seen:
-        ids, points, sights, seen = _stated(goal, context, arrays)
+        ids, points, pixels, seen = _stated(goal, context, arrays)
         if body is not None and not body.carried and body.t_ns > 0 and np.array_equal(body.ids, ids):
-            reference, rest_px = find_stated(body.basis, arrays, body.points, sights, seen)
+            reference, rest_px = find_stated(body.basis, arrays, body.points, pixels, seen)
         if rest_px > FOUND_REST_PX:
             reference = IDENTITY.copy()
             state.target = target_body(ids, points, cameras, carried=False)
@@ -165,12 +165,12 @@ def follow_target(source: Follower, context: StepContext) -> Reason | None:
         run.held = 0  # earlier frames inside the tolerance referred to a visible target
     if waits is not None:
         if followed.told in ("target_seen", "target_met"):
-            _tell("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
+            _report("target_unseen", f"{waits.hint}; the arm waits until it is there again", source, context)
     elif followed.told in ("", "target_unseen"):
-        _tell("target_seen", "the target is seen: the goal goes with it", source, context)
+        _report("target_seen", "the target is seen: the goal goes with it", source, context)
     elif followed.told == "target_seen" and run.held >= source.hold_frames and run.measured:
         message = f"error {run.newest_px:.4f} px on the target as it moves, for {run.held} frames"
-        _tell("target_met", message, source, context)
+        _report("target_met", message, source, context)
     return waits
 
 
@@ -182,7 +182,7 @@ def _missed(context: StepContext) -> bool:
     return (newest_ns - int(body.seen_ns.max())) * 1e-9 > MISSED_FRAMES / slowest_hz
 
 
-def _tell(
+def _report(
     kind: Literal["target_seen", "target_unseen", "target_met"], message: str, source: Follower, context: StepContext
 ) -> None:
     assert source.followed is not None
@@ -244,9 +244,9 @@ def _bring_set_points(source: ServoGoal, body: TargetBody, context: StepContext)
     moved = _moved(followed, body, context)
     source.target_points = transform_points(moved, followed.target_points)
     source.centre_target = transform_points(moved, followed.centre_target[None])[0]
-    here, _ = project_points(arrays.matrices, source.target_points)
-    there, _ = project_points(arrays.matrices, followed.target_points)
-    source.set_points = here + np.where(source.wanted[..., None] > 0.0, followed.set_points - there, 0.0)
+    current, _ = project_points(arrays.matrices, source.target_points)
+    followed_pixels, _ = project_points(arrays.matrices, followed.target_points)
+    source.set_points = current + np.where(source.wanted[..., None] > 0.0, followed.set_points - followed_pixels, 0.0)
     source.rates = pixel_rates(body.basis, twist, arrays.matrices, IDENTITY, source.target_points)
 
 
@@ -260,7 +260,7 @@ def _not_found(source: Follower, body: TargetBody | None, context: StepContext) 
         f"left, {FOUND_REST_PX:g} px is allowed; it is another part, or one of its markers slipped"
     )
     if context.arrays is None or context.arrays.to_euclidean is None:
-        hint += ", or it has turned by 60 degrees and more, which only a metric model tells"
+        hint += ", or it has turned by 60 degrees and more, which only a metric model distinguishes"
     return Reason("TARGET_DIFFERS", "hold", ids, body.rest_px, FOUND_REST_PX, "px", hint)
 
 
@@ -269,6 +269,6 @@ def _unseen(source: Follower, hint: str, value: float | None = None, limit: floa
     return Reason("TARGET_UNSEEN", "hold", ids, value, limit, "s" if value is not None else "", hint)
 
 
-def stands(body: TargetBody | None) -> bool:
+def is_static(body: TargetBody | None) -> bool:
     """Whether a goal's target is static, so that the goal may be reached for good."""
     return body is not None and body.t_ns > 0 and body.still

@@ -42,7 +42,7 @@ SPEED_PX = 100.0
 """Standard deviation of the speed of a target that was just found [px/s]."""
 FOUND_PX = 3.0
 """Standard deviation of the pose of a target that was just found [px]."""
-SIGHT_PX = 0.05
+OBSERVATION_PX = 0.05
 """Standard deviation of an observation in addition to its detector's [px]: the body's shape is not exact."""
 
 
@@ -174,14 +174,14 @@ def turns_about(basis: FloatArray, points: FloatArray, share: float) -> FloatArr
     """The ``basis`` (6, 4, 4), translations and rotations, with its rotations replaced by ones about the centroid of
     ``points`` (k, 4) of unit height, scaled by a ``share``.
     """
-    middle, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
+    centroid, moved = np.zeros(4), np.zeros((FREEDOMS, 4))
     for i in range(points.shape[0]):
         for a in range(4):
-            middle[a] += points[i, a] / points.shape[0]
+            centroid[a] += points[i, a] / points.shape[0]
     for k in range(FREEDOMS):
         for a in range(4):
             for b in range(4):
-                moved[k, a] += basis[k, a, b] * middle[b]
+                moved[k, a] += basis[k, a, b] * centroid[b]
     N, along = np.zeros((3, 3)), np.zeros((3, 3))  # Σ x_j T_j M = R_k M
     for i in range(3):
         for a in range(4):
@@ -290,8 +290,8 @@ def after(
     if dt_s < 0.0:  # a frame that was overtaken by another camera's
         return displaced(D, basis, dt_s * twist), twist.copy()
     fade = math.exp(-dt_s / ACCELERATION_S)
-    way = dt_s * twist + ACCELERATION_S**2 * (dt_s / ACCELERATION_S - 1.0 + fade) * rate
-    return displaced(D, basis, way), twist + ACCELERATION_S * (1.0 - fade) * rate
+    step = dt_s * twist + ACCELERATION_S**2 * (dt_s / ACCELERATION_S - 1.0 + fade) * rate
+    return displaced(D, basis, step), twist + ACCELERATION_S * (1.0 - fade) * rate
 
 
 Motion = tuple[FloatArray, FloatArray, FloatArray]
@@ -337,22 +337,22 @@ def compare(basis: FloatArray, points: FloatArray, D: FloatArray, view: View) ->
     """Residuals of a frame relative to a pose ``D``: observed minus predicted markers (k, 2) [px], zeros where they are
     not seen, and the Jacobian (k, 2, 6) by the basis.
     """
-    matrix, carrier, sights, seen = view
-    there = transform_points(carrier, transform_points(D, points))
-    pixels, _ = project_points(matrix, there)
-    J = image_jacobian(seen_through(basis, carrier), matrix, there)[0]
-    left = np.zeros(sights.shape)
+    matrix, carrier, observed, seen = view
+    moved = transform_points(carrier, transform_points(D, points))
+    pixels, _ = project_points(matrix, moved)
+    J = image_jacobian(seen_through(basis, carrier), matrix, moved)[0]
+    left = np.zeros(observed.shape)
     for i in range(seen.size):
         for a in range(2):
             if seen[i] > 0.0:
-                left[i, a] = sights[i, a] - pixels[0, i, a]
+                left[i, a] = observed[i, a] - pixels[0, i, a]
             else:
                 J[i, a, :] = 0.0
     return left, J
 
 
 @kernel
-def gate_sights(
+def gate_observations(
     left: FloatArray, J: FloatArray, variances: FloatArray, seen: FloatArray, pose: FloatArray, gate: float
 ) -> tuple[FloatArray, int, int]:
     """Which of the markers ``seen`` (k,) are explained within a ``gate`` by the covariance ``pose`` (6, 6), their
@@ -443,16 +443,16 @@ FOUND_REST_PX = 3.0
 
 
 def find_stated(
-    basis: FloatArray, arrays: ModelArrays, points: FloatArray, sights: FloatArray, seen: FloatArray
+    basis: FloatArray, arrays: ModelArrays, points: FloatArray, observed: FloatArray, seen: FloatArray
 ) -> tuple[FloatArray, float]:
     """`find_pose` for a target with any orientation: in a metric frame, from the points triangulated by several
     cameras.
     """
     start = np.eye(4)
     if arrays.to_euclidean is not None:
-        there, known = find_shape(arrays.matrices, sights, seen, arrays.plane_at_infinity)
+        M_now, known = find_shape(arrays.matrices, observed, seen, arrays.plane_at_infinity)
         H = arrays.to_euclidean
-        before, now = (from_homogeneous(move_points(H, M)) for M in (points, there))
+        before, now = (from_homogeneous(move_points(H, M)) for M in (points, M_now))
         both = (known > 0.0) & np.isfinite(before).all(axis=1) & np.isfinite(now).all(axis=1)
         before, now = before[both], now[both]
         try:
@@ -460,16 +460,16 @@ def find_stated(
         except GeometryError:  # too few by two cameras, or on a line: from its previous pose
             start = np.eye(4)
     found: tuple[FloatArray, float] = find_pose(
-        basis, arrays.matrices, np.ascontiguousarray(start), points, sights, seen
+        basis, arrays.matrices, np.ascontiguousarray(start), points, observed, seen
     )
     return found
 
 
 @kernel
 def find_pose(
-    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, sights: FloatArray, seen: FloatArray
+    basis: FloatArray, matrices: FloatArray, start: FloatArray, points: FloatArray, shown: FloatArray, seen: FloatArray
 ) -> tuple[FloatArray, float]:
-    """The displacement (4, 4) of ``points`` (k, 4) that explains ``sights`` (c, k, 2), where ``seen`` (c, k), from a
+    """The displacement (4, 4) of ``points`` (k, 4) that explains ``shown`` (c, k, 2), where ``seen`` (c, k), from a
     ``start`` (4, 4), and its residual [px] rms.
 
     Least squares from a distant start converges to a wrong pose: for rotations of 60 degrees and more.
@@ -477,17 +477,17 @@ def find_pose(
     D = start.copy()
     weights = np.repeat(seen.copy().reshape(-1), 2)
     for _ in range(FITS):
-        there = transform_points(D, points)
-        pixels, _ = project_points(matrices, there)
-        J = image_jacobian(basis, matrices, there).reshape((-1, basis.shape[0]))
-        step, _ = damped_least_squares(J, (sights - pixels).reshape(-1), weights, 1e-9)
+        moved = transform_points(D, points)
+        pixels, _ = project_points(matrices, moved)
+        J = image_jacobian(basis, matrices, moved).reshape((-1, basis.shape[0]))
+        step, _ = damped_least_squares(J, (shown - pixels).reshape(-1), weights, 1e-9)
         D = displaced(D, basis, step)
     pixels, _ = project_points(matrices, transform_points(D, points))
     total = count = 0.0
     for c in range(seen.shape[0]):
         for i in range(seen.shape[1]):
             if seen[c, i] > 0.0:
-                total += (sights[c, i, 0] - pixels[c, i, 0]) ** 2 + (sights[c, i, 1] - pixels[c, i, 1]) ** 2
+                total += (shown[c, i, 0] - pixels[c, i, 0]) ** 2 + (shown[c, i, 1] - pixels[c, i, 1]) ** 2
                 count += 2.0
     rest = math.sqrt(total / count) if count > 0.0 else math.inf
     return D, rest if math.isfinite(rest) else math.inf
@@ -498,18 +498,18 @@ def jumped(basis: FloatArray, points: FloatArray, D: FloatArray, view: View) -> 
     """The pose (4, 4) that explains a frame best, starting at ``D``; the displacement of the markers [px] rms, and the
     residual [px] rms. Arguments as in `compare`.
     """
-    matrix, carrier, sights, seen = view
+    matrix, carrier, observed, seen = view
     before = transform_points(carrier, transform_points(D, points))
     shown = seen.reshape((1, -1))
     moved, rest_px = find_pose(
-        seen_through(basis, carrier), matrix, np.eye(4), before, sights.reshape((1, -1, 2)), shown
+        seen_through(basis, carrier), matrix, np.eye(4), before, observed.reshape((1, -1, 2)), shown
     )
-    here, _ = project_points(matrix, transform_points(moved, before))
-    there, _ = project_points(matrix, before)
+    after, _ = project_points(matrix, transform_points(moved, before))
+    pixels, _ = project_points(matrix, before)
     total = count = 0.0
     for i in range(seen.size):
         if seen[i] > 0.0:
-            total += (here[0, i, 0] - there[0, i, 0]) ** 2 + (here[0, i, 1] - there[0, i, 1]) ** 2
+            total += (after[0, i, 0] - pixels[0, i, 0]) ** 2 + (after[0, i, 1] - pixels[0, i, 1]) ** 2
             count += 2.0
     half, pose = np.empty((4, 4)), np.empty((4, 4))
     multiply4_into(invert4(carrier), moved, half)  # C⁻¹ M C D
@@ -538,12 +538,12 @@ def pixel_rates(
 
 @kernel
 def find_shape(
-    matrices: FloatArray, sights: FloatArray, seen: FloatArray, plane: FloatArray
+    matrices: FloatArray, observed: FloatArray, seen: FloatArray, plane: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Points (k, 4) of unit height above the ``plane`` (4,) at infinity that are seen by two or more cameras, and which
     these are (k,) 1 or 0.
     """
-    points, ok = triangulate(matrices, sights, seen, 5)
+    points, ok = triangulate(matrices, observed, seen, 5)
     known = np.zeros(points.shape[0])
     for i in range(points.shape[0]):
         views, height = 0.0, 0.0

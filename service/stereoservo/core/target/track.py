@@ -17,14 +17,14 @@ from stereoservo.core.block import HISTORY
 from stereoservo.core.context import StepContext
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.monitor_state import ModelDiagnosis
-from stereoservo.core.prediction import chain_at, gate_threshold, positions_at, undistort_sights
+from stereoservo.core.prediction import chain_at, gate_threshold, positions_at, undistort_observations
 from stereoservo.core.settings import CoreSettings
 from stereoservo.core.state import CoreState
 from stereoservo.core.target.motion import (
     FOUND_PX,
     FOUND_REST_PX,
     FREEDOMS,
-    SIGHT_PX,
+    OBSERVATION_PX,
     SPEED_PX,
     TargetBody,
     View,
@@ -35,7 +35,7 @@ from stereoservo.core.target.motion import (
     find_shape,
     find_stated,
     fold_frame,
-    gate_sights,
+    gate_observations,
     jumped,
     target_body,
     widen,
@@ -64,7 +64,7 @@ SMALL_PX = 0.5
 """Residual rms [px] that needs no explanation: models are not exact."""
 RIGID_PX = 1.0
 """Largest residual rms [px] of a motion of the target."""
-FOUND_ANEW = 6
+REDETECT_FRAMES = 6
 """Consecutive frames explained only by a jump of the target, after which it is found again."""
 OTHERS = ("joint_zero", "camera_moved", "marker_slipped")
 """Diagnoses of other motions, which are not tracked as motions of the target."""
@@ -100,23 +100,23 @@ def take_frame(camera: int, observation: CameraObservation, context: StepContext
         if not body.told[camera]:  # earlier estimates assumed a static target
             state.cameras[camera].seen_ns[:] = 0
             body.told[camera] = True
-        context.derived.room.arrays["marker_points"][:] = _points(body, t_ns)
+        context.derived.workspace.arrays["marker_points"][:] = _points(body, t_ns)
 
 
 def _frame_of(
     body: TargetBody, camera: int, observation: CameraObservation, context: StepContext
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The target's markers in a frame, as from `target_sights`, without slipped markers of the model's body."""
+    """The target's markers in a frame, as from `target_observations`, without slipped markers of the model's body."""
     arrays = context.derived.arrays
     assert arrays is not None
-    sights, variances, seen = target_sights(
+    observed, variances, seen = target_observations(
         body.ids,
         observation.ids.astype(np.int64),
         np.array(observation.pixels, np.float64, order="C"),
         np.array(observation.covariances, np.float64, order="C"),
         arrays.lenses[camera],
     )
-    return sights, variances, seen * (1.0 - context.state.watching.masked) if body.carried else seen
+    return observed, variances, seen * (1.0 - context.state.watching.masked) if body.carried else seen
 
 
 def present_arrays(context: StepContext) -> ModelArrays | None:
@@ -125,7 +125,7 @@ def present_arrays(context: StepContext) -> ModelArrays | None:
     if arrays is None or body is None or not body.carried or body.t_ns == 0:
         return arrays
     points = _points(body, context.now_ns)
-    context.derived.room.arrays["marker_points"][:] = points
+    context.derived.workspace.arrays["marker_points"][:] = points
     here = copy(arrays)
     object.__setattr__(here, "marker_points", points)
     return here
@@ -157,21 +157,21 @@ def _carrier(body: TargetBody, t_ns: int, state: CoreState, arrays: ModelArrays)
 
 
 @kernel
-def target_sights(
-    wanted: IntArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, lens: FloatArray
+def target_observations(
+    target_ids: IntArray, ids: IntArray, pixels: FloatArray, covariances: FloatArray, lens: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """The observations of the markers ``wanted`` (k,) in a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with
+    """The observations of the markers ``target_ids`` (k,) in a frame of ``ids`` (s,), raw ``pixels`` (s, 2) with
     ``covariances`` (s, 2, 2): ideal pixels (k, 2), variances of a coordinate (k,) [px²], and which are seen (k,) 1 or
     0.
     """
-    ideal, spread, possible = undistort_sights(lens, pixels, covariances)
-    k = wanted.size
+    ideal, covariance, possible = undistort_observations(lens, pixels, covariances)
+    k = target_ids.size
     found, variances, seen = np.zeros((k, 2)), np.ones(k), np.zeros(k)
     for s in range(ids.size):
         for i in range(k):
-            if ids[s] == wanted[i] and possible[s]:
+            if ids[s] == target_ids[i] and possible[s]:
                 found[i] = ideal[s]
-                variances[i] = 0.5 * (spread[s, 0, 0] + spread[s, 1, 1]) + SIGHT_PX * SIGHT_PX
+                variances[i] = 0.5 * (covariance[s, 0, 0] + covariance[s, 1, 1]) + OBSERVATION_PX * OBSERVATION_PX
                 seen[i] = 1.0
     return found, variances, seen
 
@@ -190,7 +190,7 @@ def _find(
     body: TargetBody,
     camera: int,
     t_ns: int,
-    sights: FloatArray,
+    observed: FloatArray,
     seen: FloatArray,
     carrier: FloatArray,
     arrays: ModelArrays,
@@ -202,15 +202,15 @@ def _find(
     if body.carried:
         begin(body, basis, metric, arrays.matrices, carrier, t_ns)
         return
-    at_ns, there, shown = _at_one_moment(body, camera, t_ns, sights, seen)
-    body.first[camera], body.first_seen[camera], body.seen_ns[camera] = sights, seen, t_ns
+    at_ns, simultaneous, shown = _at_one_instant(body, camera, t_ns, observed, seen)
+    body.first[camera], body.first_seen[camera], body.seen_ns[camera] = observed, seen, t_ns
     if int((shown.max(axis=1) > 0.0).sum()) < 2:
         return
-    points, known = find_shape(arrays.matrices, there, shown, arrays.plane_at_infinity)
+    points, known = find_shape(arrays.matrices, simultaneous, shown, arrays.plane_at_infinity)
     pixels, _ = project_points(arrays.matrices, points)
-    apart = np.sqrt(((pixels - there) ** 2).sum(axis=-1)) * shown
+    distances = np.sqrt(((pixels - simultaneous) ** 2).sum(axis=-1)) * shown
     # Rays that do not intersect: swapped markers, or a reflection.
-    wrong = (known > 0.0) & ~(apart.max(axis=0) <= FOUND_REST_PX)
+    wrong = (known > 0.0) & ~(distances.max(axis=0) <= FOUND_REST_PX)
     known[wrong], shown[:, wrong] = 0.0, 0.0
     if not body.stated:
         if int(known.sum()) < FEWEST_TO_FIND:
@@ -220,7 +220,7 @@ def _find(
         return
     if int((shown.max(axis=0) > 0.0).sum()) < FEWEST:
         return
-    D, rest = find_stated(basis, arrays, body.points, there, shown)
+    D, rest = find_stated(basis, arrays, body.points, simultaneous, shown)
     if rest > FOUND_REST_PX:
         body.rest_px = rest
         return
@@ -228,29 +228,29 @@ def _find(
     begin(body, basis, metric, arrays.matrices, carrier, at_ns)
 
 
-def _at_one_moment(
-    body: TargetBody, camera: int, t_ns: int, sights: FloatArray, seen: FloatArray
+def _at_one_instant(
+    body: TargetBody, camera: int, t_ns: int, observed: FloatArray, seen: FloatArray
 ) -> tuple[int, FloatArray, FloatArray]:
     """Time at which another camera saw the target last, the pixels (c, k, 2) of all cameras at that time, and which
     markers they show (c, k) 1 or 0. Those of this camera are interpolated between its previous frame and this one, or
     extrapolated, because the target moves between the shutter times.
     """
-    there, shown = body.first.copy(), body.first_seen.copy()
+    pixels, shown = body.first.copy(), body.first_seen.copy()
     others = shown.max(axis=1) > 0.0
     others[camera] = False
     at_ns = int(body.seen_ns[others].max()) if others.any() else t_ns
     shown *= (np.abs(body.seen_ns - at_ns) <= TOGETHER_NS)[:, None]
-    there[camera], shown[camera] = sights, seen
+    pixels[camera], shown[camera] = observed, seen
     if abs(t_ns - at_ns) <= TOGETHER_NS:
-        return at_ns, there, shown
+        return at_ns, pixels, shown
     before, gap_ns = body.first[camera], t_ns - int(body.seen_ns[camera])
     share = (at_ns - t_ns) / gap_ns if 0 < gap_ns <= LONGEST_GAP_NS else np.inf
     if -1.0 - FARTHEST_SHARE <= share <= FARTHEST_SHARE:
-        there[camera] += share * (sights - before)
+        pixels[camera] += share * (observed - before)
         shown[camera] *= body.first_seen[camera]
     else:
         shown[camera] = 0.0
-    return at_ns, there, shown
+    return at_ns, pixels, shown
 
 
 def _keep(body: TargetBody, known: np.ndarray[tuple[int], np.dtype[np.bool_]], points: FloatArray) -> None:
@@ -275,7 +275,7 @@ def restart(state: CoreState, arrays: ModelArrays, settings: CoreSettings) -> No
         body.points[:] = arrays.marker_points
 
 
-def tell_untrackable(context: StepContext) -> None:
+def report_untrackable(context: StepContext) -> None:
     """Warn if the body is declared to move, and the new model determines no displacements."""
     model = context.state.model
     if model is None or context.state.target is not None or not context.settings.body_moves:
@@ -304,7 +304,7 @@ def _follow(
     carrier: FloatArray,
     context: StepContext,
 ) -> None:
-    sights, variances, seen = frame
+    observed, variances, seen = frame
     state, arrays = context.state, context.derived.arrays
     assert arrays is not None
     stood = pose_at(body, int(body.seen_ns.max()))[0]
@@ -313,20 +313,20 @@ def _follow(
         elapse(body.displacement, body.basis, body.drift, (body.twist, body.rate, body.covariance), dt_s)
         body.t_ns = t_ns
     pose = pose_at(body, t_ns)[0]
-    view = arrays.matrices[camera : camera + 1], carrier, sights, seen
+    view = arrays.matrices[camera : camera + 1], carrier, observed, seen
     left, J = compare(body.basis, body.points, pose, view)
     gate = gate_threshold(context.settings.gate_sigma)
     since_s = (t_ns - int(body.seen_ns.max())) * 1e-9
     lost = (t_ns - int(max(body.seen_ns.max(), body.odd_ns.max()))) * 1e-9 > LOST_S
     if lost and not body.carried:  # one camera alone may confuse a flat one with its mirror image
         body.t_ns, body.seen_ns[:], body.odd_ns[:], body.first_seen[:] = 0, 0, 0, 0.0
-        _find(body, camera, t_ns, sights, seen, carrier, arrays)
+        _find(body, camera, t_ns, observed, seen, carrier, arrays)
         return
     used = None if lost else _explained(body, left, J, variances, seen, gate)
     sudden = used is None or float((left * left)[used > 0.0].sum(axis=-1).mean()) > RIGID_PX**2
     if used is None:
         found, moved_px, rest_px = jumped(body.basis, body.points, pose, view)
-        stops = _apart_px(body, stood, found, *view[:2]) < min(moved_px, SPEED_PX * since_s + SMALL_PX)
+        stops = _shift_px(body, stood, found, *view[:2]) < min(moved_px, SPEED_PX * since_s + SMALL_PX)
         if lost and rest_px <= RIGID_PX:
             widen(body, FOUND_PX)
             body.odd, body.told[:] = 0, False
@@ -345,7 +345,7 @@ def _follow(
             sighting.t_ns = 0
     _fold(body, left, J, view, variances, used, ROUNDS if sudden else 1)
     body.seen_ns[camera], body.odd_ns[camera] = t_ns, 0
-    _look_whether_still(body, t_ns, arrays.matrices[camera : camera + 1], carrier)
+    _update_stillness(body, t_ns, arrays.matrices[camera : camera + 1], carrier)
 
 
 def _fold(
@@ -368,7 +368,7 @@ def _explained(
 ) -> FloatArray | None:
     """The markers (k,) 1 or 0 that the predicted motion explains; None if it does not explain most of them."""
     pose = np.ascontiguousarray(body.covariance[:FREEDOMS, :FREEDOMS])
-    within, used, count = gate_sights(left, J, variances, seen, pose, gate)
+    within, used, count = gate_observations(left, J, variances, seen, pose, gate)
     if used >= FEWEST and 2 * used > count:
         return within
     if float((left * left).sum()) <= 2.0 * count * SMALL_PX**2:
@@ -392,23 +392,23 @@ def _jumps(
         return False
     quick = moved_px > SPEED_PX * since_s + SMALL_PX
     named = any(verdict.kind in OTHERS for verdict in (*state.watching.last, state.watching.verdict))
-    if quick and (named or body.odd < FOUND_ANEW):
+    if quick and (named or body.odd < REDETECT_FRAMES):
         return False
     widen(body, FOUND_PX + 0.1 * moved_px)
     body.odd, body.told[:] = 0, False
     return True
 
 
-def _apart_px(body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray) -> float:
+def _shift_px(body: TargetBody, one: FloatArray, other: FloatArray, matrix: FloatArray, carrier: FloatArray) -> float:
     """Rms distance [px] of the images of its markers at two displacements (4, 4)."""
-    here, there = (
+    first, second = (
         project_points(matrix, transform_points(carrier, transform_points(D, body.points)))[0] for D in (one, other)
     )
-    return float(np.sqrt(((here - there) ** 2).sum(axis=-1).mean()))
+    return float(np.sqrt(((first - second) ** 2).sum(axis=-1).mean()))
 
 
-def _look_whether_still(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:
-    moved_px = _apart_px(body, body.displacement, body.mark, matrix, carrier)
+def _update_stillness(body: TargetBody, t_ns: int, matrix: FloatArray, carrier: FloatArray) -> None:
+    moved_px = _shift_px(body, body.displacement, body.mark, matrix, carrier)
     body.farthest_px = max(body.farthest_px, moved_px)
     if body.farthest_px > STILL_PX:
         body.still = False

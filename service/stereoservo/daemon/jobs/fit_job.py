@@ -21,7 +21,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.calibration.calibration_result import CalibrationFit
-from stereoservo.calibration.fit_assessment import Acceptance, assess_failure, assess_fit, depth_spread
+from stereoservo.calibration.fit_assessment import Acceptance, assess_failure, assess_fit, depth_deviation
 from stereoservo.calibration.self_calibration import fit_model
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, figures_file, load_trials, report_folder
 from stereoservo.control.marker_groups import with_groups
@@ -85,7 +85,7 @@ def fit_trials(
     write_atomically(figures_file(model_path), figures)
     # Last: an existing model file is used from the next start on, even if the fit then fails because of a full disk.
     save_model(with_groups(result.model), model_path)
-    return result, assess_fit(result.model, result.report, depth_spread(result.model, trials))
+    return result, assess_fit(result.model, result.report, depth_deviation(result.model, trials))
 
 
 def report_fit(

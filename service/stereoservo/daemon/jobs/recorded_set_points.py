@@ -22,7 +22,7 @@ rejected by chance.
 """
 MOVED_PX = 0.1
 """Largest drift of a marker from the first frame to the last [px] that is always accepted."""
-APART_PX = 0.2
+LEAST_GATE_PX = 0.2
 """Largest deviation of one frame from the mean [px] that is always accepted."""
 
 
@@ -60,17 +60,17 @@ def set_points_from_images(cell_path: Path, images: Path, at_s: float, frames: i
     """
     cell = load_cell_file(cell_path)
     files = {camera.name: video_of(images, camera.name) for camera in cell.camera}
-    there = {name: file for name, file in files.items() if file.is_file()}
-    if not there:
+    found = {name: file for name, file in files.items() if file.is_file()}
+    if not found:
         raise SetPointError(
             "no_recording",
             f"{images} holds none of {', '.join(file.name for file in files.values())}, recordings of the cameras of "
             f"{cell_path}; `stereoservo record CELL --images` makes them",
         )
-    begin_ns = min(line.t_shutter_ns for file in there.values() for line in islice(image_lines(file), 1))
+    begin_ns = min(line.t_shutter_ns for file in found.values() for line in islice(image_lines(file), 1))
     from_ns = begin_ns + round(at_s * 1e9)
     return tuple(
-        _camera_set_points(cell, cell_path, name, file, begin_ns, from_ns, frames) for name, file in there.items()
+        _camera_set_points(cell, cell_path, name, file, begin_ns, from_ns, frames) for name, file in found.items()
     )
 
 
@@ -134,7 +134,7 @@ def _require_rest(camera: str, marker: int, t: FloatArray, pixels: FloatArray, v
     more than the variances (n,) [px²] explain.
     """
     off = np.abs(pixels - np.median(pixels, axis=0)).max(axis=1)
-    beyond = off > np.maximum(GATE_SIGMAS * np.sqrt(variances), APART_PX)
+    beyond = off > np.maximum(GATE_SIGMAS * np.sqrt(variances), LEAST_GATE_PX)
     late = t - t.mean()
     rate = late @ pixels / max(float(late @ late), 1e-12)
     deviation = float(np.sqrt(variances.mean() / max(float(late @ late), 1e-12)))

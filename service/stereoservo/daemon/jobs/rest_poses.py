@@ -22,7 +22,7 @@ from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import CameraObservation
 
 MOST_POSES = 128
-APART = 0.02
+LEAST_DISTANCE = 0.02
 """Distance of two poses [rad or m, over all joints] below which they count as equal."""
 STILL = 2e-4
 """Motion of a joint [rad or m] that ends a rest."""
@@ -102,18 +102,18 @@ class RestPoses:
 
     def _keep(self, pose: Event, joints: FloatArray) -> bool:
         away = [float(np.linalg.norm(place - joints)) for place in self._places]
-        if away and min(away) < APART:
+        if away and min(away) < LEAST_DISTANCE:
             self.poses[int(np.argmin(away))] = pose  # the newer one describes the current cell
             return False
         self.poses.append(pose)
         self._places.append(joints)
         if len(self.poses) > MOST_POSES:
-            places = np.array(self._places)
-            apart = np.linalg.norm(places[:, None] - places[None], axis=2)
-            apart[np.diag_indices(len(places))] = np.inf
+            configurations = np.array(self._places)
+            distances = np.linalg.norm(configurations[:, None] - configurations[None], axis=2)
+            distances[np.diag_indices(len(configurations))] = np.inf
             # Of the two nearest poses, the one with the nearer second neighbour is removed.
-            pair = np.unravel_index(int(apart.argmin()), apart.shape)
-            second = [float(np.partition(apart[k], 1)[1]) for k in pair]
+            pair = np.unravel_index(int(distances.argmin()), distances.shape)
+            second = [float(np.partition(distances[k], 1)[1]) for k in pair]
             gone = int(pair[int(np.argmin(second))])
             del self.poses[gone], self._places[gone]
         return True

@@ -17,9 +17,9 @@ from stereoservo.calibration.sweeps import (
 )
 from stereoservo.calibration.trial_data import (
     CalibrationError,
+    PathObservations,
     TrialCamera,
     TrialData,
-    WayObservations,
     finite_rows,
     static_markers,
     static_observations,
@@ -147,7 +147,7 @@ class TrialCollector:
             way=self._paths(),
         )
 
-    def _paths(self) -> WayObservations | None:
+    def _paths(self) -> PathObservations | None:
         """Observations between the stops and on the sweeps; None if there are none."""
         records = [(k, event.path) for k, event in enumerate(self._stops) if event.path is not None]
         records += [(event.path.leg, event.path) for event in self._sweeps if event.path is not None]
@@ -161,7 +161,7 @@ class TrialCollector:
             markers[row, : len(frame.ids)] = frame.ids
             pixels[row, : len(frame.ids)] = frame.pixels
         start_ns = int(records[0][1].joints_ns[0])  # clock of this boot: relative seconds keep their precision
-        return WayObservations(
+        return PathObservations(
             ways=np.array([k for k, _ in frames], dtype=np.int64),
             cameras=np.array([frame.camera for _, frame in frames], dtype=np.int64),
             times=np.array([1e-9 * (frame.t_ns - start_ns) for _, frame in frames]),

@@ -69,7 +69,7 @@ def postures(
     if int(known.sum()) < FEWEST:
         raise InverseKinematicsError(
             "shape",
-            f"{int(known.sum())} markers are shown to two cameras; {FEWEST} are needed: a posture is told from "
+            f"{int(known.sum())} markers are shown to two cameras; {FEWEST} are needed: a posture is found from "
             "points in space",
         )
     structure = recognise(model) if recognition is None else recognition
