@@ -71,74 +71,52 @@ def compare_benchmark_180(answer: dict[str, Any]) -> list[Comparison]:
     rows, summary, curves = answer["rows"], answer["beside_thesis"], answer["curves"]
     return [
         *(_classical_compared(row) for row in rows if row["law"] in CLASSICAL),
-        *_planned_compared(summary),
-        *_tracks_compared(curves),
+        *(_planned_compared(item) for item in summary if "planned" in item),
+        _tracks_compared(curves),
         *(row for law in CARTESIAN[:2] for row in _line_compared(law, rows)),
-        *_errors_compared(rows, summary),
-        *_curves_compared(curves),
+        _rates_compared("fig. 8.19", "cartesian2", rows),
+        _rates_compared("fig. 8.20", "cartesian3", rows),
+        *_curves_compared(rows, summary, curves),
     ]
 
 
 def _classical_compared(row: Curve) -> Comparison:
     """A run of a classical law (fig. 8.14)."""
-    what = f"{CLASSICAL[row['law']].name}, {row['scene']}"
     lost = row["reason"] == "EXTRACTION_LOST"
-    ours = f"{'keeps the face' if row['face_visible'] else 'shows the back'}, stalled {row['stalled_s']:.1f} s, " + (
-        f"goes out to {row['farthest_m']:.1f} m and is lost" if lost else f"{row['final_error_px']:.2g} px at the end"
-    )
+    ours = f"{'keeps the face' if row['face_visible'] else 'shows the back'}, stalled {row['stalled_s']:.1f} s, "
+    ours += f"lost {row['farthest_m']:.1f} m away" if lost else f"{row['final_error_px']:.2g} px at the end"
+    said, criterion = "self-occlusion, trapped, escapes, converges", "it shows the back, stalls for 1 s and converges"
+    seen = not lost and not row["face_visible"] and row["final_error_px"] < 1.0 and row["stalled_s"] > 1.0
+    why = f"it is not trapped: its image error never falls at less than {SLOW:g} of the gain, as the centre moves too"
     if row["law"] == "stereo-block":
+        said, seen, why = "diverges while moving towards infinity", lost, ""
         criterion = f"it goes out until dots of {100 * DOT_M:g} cm are below {DOT_PX:g} px, where they are lost"
-        return of_statement("fig. 8.14", what, "diverges while moving towards infinity", ours, criterion, lost)
-    converges = not row["face_visible"] and not lost and row["final_error_px"] < 1.0
-    return of_statement(
-        "fig. 8.14",
-        what,
-        "self-occlusion, trapped, escapes, converges",
-        ours,
-        "it shows the back, stalls for 1 s and converges",
-        converges and row["stalled_s"] > 1.0,
-        f"it is not trapped: its image error never falls at less than {SLOW:g} of the gain, as the centre moves too",
-    )
+    return of_statement("fig. 8.14", f"{CLASSICAL[row['law']][0]}, {row['scene']}", said, ours, criterion, seen, why)
 
 
-def _planned_compared(summary: list[Curve]) -> list[Comparison]:
-    return [
-        of_statement(
-            "fig. 8.15" if item["planned"] == "linear" else "fig. 8.16",
-            f"planned, {item['planned']}, {item['scene']}",
-            "self-occlusion avoided",
-            f"cosine to the face from {item['smallest_facing']:.2f}",
-            "above 0 on the whole path",
-            item["smallest_facing"] > 0.0,
-        )
-        for item in summary
-        if "planned" in item
-    ]
+def _planned_compared(item: Curve) -> Comparison:
+    """A planned path (figs 8.15, 8.16)."""
+    figure, facing = "fig. 8.15" if item["planned"] == "linear" else "fig. 8.16", item["smallest_facing"]
+    what, ours = f"planned, {item['planned']}, {item['scene']}", f"cosine to the face from {facing:.2f}"
+    return of_statement(figure, what, "self-occlusion avoided", ours, "above 0 on the whole path", facing > 0.0)
 
 
-def _tracks_compared(curves: list[Curve]) -> list[Comparison]:
+def _tracks_compared(curves: list[Curve]) -> Comparison:
     """Markers' tracks of both Cartesian laws, with the thesis's step (fig. 8.17)."""
-    three, two = (
-        np.array(
-            _of(curves, scene="aside", law=law, gain=GAIN, step="first order", joint_speed_deg_s=None)[0]["pixels"]
-        )
-        for law in CARTESIAN[:2]
-    )
+    runs = _of(curves, scene="aside", gain=GAIN, step="first order", joint_speed_deg_s=None)
+    three, two = (np.array(_of(runs, law=law)[0]["pixels"]) for law in CARTESIAN[:2])
     tracks = [(three[:, c, p], two[:, c, p]) for c in range(three.shape[1]) for p in range(three.shape[2])]
     apart = max(float(distances_from_track(*pair).max()) for pair in tracks)
     length = float(np.linalg.norm(np.diff(three, axis=0), axis=-1).sum(axis=0).max())
-    return [
-        of_statement(
-            "fig. 8.17",
-            "image tracks of directTHREE beside those of directTWO",
-            "very small deviation",
-            f"{apart:.0f} px at most, of a track of {length:.0f} px",
-            "a twentieth of the track at most",
-            apart < 0.05 * length,
-            "directTHREE turns about two axes at once, directTWO about one: other rotations lead to the same goal; the "
-            "thesis prints no value",
-        )
-    ]
+    return of_statement(
+        "fig. 8.17",
+        "image tracks of directTHREE beside those of directTWO",
+        "very small deviation",
+        f"{apart:.0f} px at most, of a track of {length:.0f} px",
+        "a twentieth of the track at most",
+        apart < 0.05 * length,
+        "directTHREE turns about two axes at once, directTWO about one; the thesis prints no value",
+    )
 
 
 def distances_from_track(points: FloatArray, track: FloatArray) -> FloatArray:
@@ -154,98 +132,71 @@ def _line_compared(law: str, rows: list[Curve]) -> list[Comparison]:
     mine = _of(rows, law=law, arm="rx90", scene="aside")
     slow = [row["line_deviation_mm"] for row in mine if row["joint_speed_deg_s"] is not None]
     first, corrected = (
-        {row["gain"]: row["line_deviation_mm"] for row in _of(mine, step=step, joint_speed_deg_s=None)}
+        [row["line_deviation_mm"] for gain in GAINS for row in _of(mine, gain=gain, step=step, joint_speed_deg_s=None)]
         for step in ("first order", "corrected")
     )
     if not slow or len(first) < len(GAINS):
         return []
-    ways, without = ([found[gain] for gain in GAINS] for found in (first, corrected))
-    gains = ", ".join(f"{gain:g}" for gain in GAINS)
+    told, left = (", ".join(f"{way:.2g}" for way in ways) + " mm at gains " + GAINS_TOLD for ways in (first, corrected))
+    grows, least = first == sorted(first), slow[0] < first[0]
+    without = all(after <= 0.1 * before for after, before in zip(corrected, first, strict=True))
     return [
-        of_statement(
-            "fig. 8.18",
-            f"{law}, centre beside its line",
-            "less at smaller gains, least with joints limited to 5°/s",
-            f"{', '.join(f'{way:.2g}' for way in ways)} mm at gains {gains}; limited {slow[0]:.2g} mm",
-            "it grows from gain to gain; limited below all",
-            ways == sorted(ways) and slow[0] < ways[0],
-        ),
-        of_statement(
-            "fig. 8.18",
-            f"{law}, cause of the deviation",
-            "integration error of the joint velocities",
-            f"{', '.join(f'{way:.2g}' for way in without)} mm at gains {gains} if the step is corrected for it",
-            "a tenth of the deviation or less is left at each gain",
-            all(left <= 0.1 * way for left, way in zip(without, ways, strict=True)),
-        ),
-    ]
-
-
-def _errors_compared(rows: list[Curve], summary: list[Curve]) -> list[Comparison]:
-    """Control errors (figs 8.19, 8.20)."""
-    found = []
-    for figure, law in (("fig. 8.19", "cartesian2"), ("fig. 8.20", "cartesian3")):
-        mine = _of(rows, scene="aside", law=law, model="projective", joint_speed_deg_s=None)
-        first, largest, corrected = (
-            [
-                row[f"{name}_rate"]
-                for row in _of(mine, gain=gain, step=step)
-                for name in COMPONENTS
-                if row[f"{name}_rate"]
-            ]
-            for gain, step in (
-                (GAIN, "first order"),
-                (max(row["gain"] for row in mine), "first order"),
-                (GAIN, "corrected"),
-            )
-        )
-        found.append(
-            of_statement(
-                figure,
-                f"{law}, control errors, first-order step as in the thesis",
-                "exponential convergence",
-                f"rates {min(first):.3f} to {max(first):.3f} of the gain {GAIN:g}/s; at the largest gain to "
-                f"{max(largest):.3f}; with the corrected step {min(corrected):.3f} to {max(corrected):.3f}",
-                f"0.95 to 1.05 of the gain {GAIN:g}/s",
-                min(first) > 0.95 and max(first) < 1.05,
-            )
-        )
-    starts = sorted({row["theta_start_deg"][0] for row in _of(rows, scene="aside", law="cartesian2")})
-    (overlap,) = [item for item in summary if "overlap" in item]
-    largest_angle = max(overlap["theta_r_apart_deg"], overlap["theta_p_apart_deg"])
-    return [
-        *found,
-        of_statement("fig. 8.19", "theta_s at the start, with and without limited joints", "180°",
-                     f"{starts[0]:.1f} to {starts[-1]:.1f}°", "within 0.5°",
-                     all(abs(start - 180.0) < 0.5 for start in starts)),
-        of_statement("fig. 8.20", "projective beside Euclidean model", "almost perfect overlap of the angles",
-                     f"{largest_angle:.2g}° apart at most", "0.5° at most", largest_angle < 0.5),
-        of_statement("fig. 8.20", "tau, normalised to 100, beside Euclidean truth", "differs by its scale only",
-                     f"{overlap['tau_from_truth_of_100']:.2g} of 100 apart at most; scale {overlap['tau_scale']:.2g}",
-                     "1 of 100 at most", overlap["tau_from_truth_of_100"] < 1.0),
+        of_statement("fig. 8.18", f"{law}, centre beside its line", "less at smaller gains, least with limited joints",
+                     f"{told}; limited to {JOINT_SPEED_DEG_S:g}°/s {slow[0]:.2g} mm",
+                     "it grows from gain to gain; limited below all", grows and least),
+        of_statement("fig. 8.18", f"{law}, cause of the deviation", "integration error of the joint velocities",
+                     f"{left} if the step is corrected for it", "a tenth of it or less is left at each gain", without),
     ]  # fmt: skip
 
 
-def _curves_compared(curves: list[Curve]) -> list[Comparison]:
-    """Figs 8.21 and 8.22 from the curves of the RX 90, with the thesis's step."""
-    chosen = _of(curves, scene="aside", arm="rx90", law="cartesian3", gain=GAIN, step="first order")
-    if not chosen:
-        return []
+def _rates_compared(figure: str, law: str, rows: list[Curve]) -> Comparison:
+    """Decay of the control errors (figs 8.19, 8.20)."""
+    mine = _of(rows, scene="aside", law=law, model="projective", joint_speed_deg_s=None)
+
+    def rates(step: str, gain: float) -> list[float]:
+        of_runs = [row[f"{name}_rate"] for row in _of(mine, step=step, gain=gain) for name in COMPONENTS]
+        return sorted(rate for rate in of_runs if rate is not None)
+
+    first, corrected = rates("first order", GAIN), rates("corrected", GAIN)
+    highest = rates("first order", max(row["gain"] for row in mine))[-1]
+    return of_statement(
+        figure,
+        f"{law}, control errors, first-order step as in the thesis",
+        "exponential convergence",
+        f"rates {first[0]:.3f} to {first[-1]:.3f} of the gain {GAIN:g}/s, up to {highest:.3f} of the largest; "
+        f"with the corrected step {corrected[0]:.3f} to {corrected[-1]:.3f} of the gain {GAIN:g}/s",
+        f"0.95 to 1.05 of the gain {GAIN:g}/s",
+        first[0] > 0.95 and first[-1] < 1.05,
+    )
+
+
+def _curves_compared(rows: list[Curve], summary: list[Curve], curves: list[Curve]) -> list[Comparison]:
+    """Angles and translation (figs 8.19, 8.20); image errors and joints of the RX 90, first-order step (8.21, 8.22)."""
+    starts = sorted(row["theta_start_deg"][0] for row in _of(rows, scene="aside", law="cartesian2"))
+    (overlap,) = [item for item in summary if "overlap" in item]
+    angle, tau = max(overlap["theta_r_apart_deg"], overlap["theta_p_apart_deg"]), overlap["tau_from_truth_of_100"]
+    chosen = _of(curves, scene="aside", law="cartesian3", gain=GAIN, step="first order", joint_speed_deg_s=None)
     (curve,) = chosen
     errors = np.abs(np.array(curve["image_errors_px"])).reshape(len(curve["image_errors_px"]), -1)
     rises = [float(np.maximum(np.diff(column), 0.0).sum()) for column in errors.T]
     centre = np.array(curve["centre_px"])
     length, beside = float(np.ptp(centre[:, 0])), float(np.abs(centre[:, 1] - centre[-1, 1]).max())
     speeds = np.abs(np.diff(curve["joints_deg"][:2], axis=0)[0]) / (curve["seconds"][1] - curve["seconds"][0])
-    fastest = np.argsort(-speeds)[:2]
+    fastest = " and ".join(f"q{j + 1} ({speeds[j]:.0f}°/s)" for j in np.argsort(-speeds)[:2])
     return [
+        of_statement("fig. 8.19", "theta_s at the start, with and without limited joints", "180°",
+                     f"{starts[0]:.1f} to {starts[-1]:.1f}°", "within 0.5°", 179.5 < starts[0] <= starts[-1] < 180.5),
+        of_statement("fig. 8.20", "projective beside Euclidean model", "almost perfect overlap of the angles",
+                     f"{angle:.2g}° apart at most", "0.5° at most", angle < 0.5),
+        of_statement("fig. 8.20", "tau, normalised to 100, beside Euclidean truth", "differs by its scale only",
+                     f"{tau:.2g} of 100 apart at most; scale {overlap['tau_scale']:.2g}", "1 of 100 at most", tau < 1.0),
         of_statement("fig. 8.21", "errors of the markers' images", "neither exponential nor monotonic",
                      f"they rise by {max(rises):.0f} px on the path", "a rise of 10 px or more", max(rises) > 10.0),
         of_statement("fig. 8.21", "zero line: image of the centre's path", "straight and horizontal",
                      f"{beside:.1f} px off the horizontal on {length:.0f} px", "a fiftieth of its length at most",
                      beside < 0.02 * length),
         not_comparable("fig. 8.22", "joints that are fastest at the start", "q1 and q3, the cause of fig. 8.18",
-                       " and ".join(f"q{j + 1} ({speeds[j]:.0f}°/s)" for j in fastest) + f" at gain {GAIN:g}/s",
+                       f"{fastest} at gain {GAIN:g}/s",
                        "the thesis does not print where its arm stands: in other postures other joints are fast"),
     ]  # fmt: skip
 
@@ -438,6 +389,7 @@ def _nearest(found: FloatArray, q: FloatArray) -> FloatArray | None:
 
 GAINS = (0.5, 1.0, 2.0, 4.0)
 """Gains [1/s]."""
+GAINS_TOLD = ", ".join(f"{gain:g}" for gain in GAINS)
 GAIN = 0.5
 NOISE_PX = 0.1
 JOINT_SPEED_DEG_S = 5.0
@@ -447,22 +399,12 @@ SLOW, FAR_PX = 0.1, 20.0
 """Decay rate as a share of the gain, and total image error, at which a law counts as stalled."""
 LEAST_ANGLE = 0.05
 """Least initial angle [rad] whose decay is fitted."""
-TRAPPED = "translates, shows the back, is trapped, escapes, turns in place showing the back again, converges"
-
-
-class ClassicalLaw(NamedTuple):
-    """A classical law: its ``name`` in the thesis, the model that it needs, the thesis's observation of it."""
-
-    name: str
-    model: str
-    said: str
-
-
 CLASSICAL = {
-    "stereo": ClassicalLaw("stacked Jacobians", "projective", TRAPPED),
-    "stereo-block": ClassicalLaw("block-wise pseudo-inverse", "projective", "diverges while moving towards infinity"),
-    "euclidean-points": ClassicalLaw("Jacobian for 3D Euclidean points", "metric", TRAPPED),
+    "stereo": ("stacked Jacobians", "projective"),
+    "stereo-block": ("block-wise pseudo-inverse", "projective"),
+    "euclidean-points": ("Jacobian for 3D Euclidean points", "metric"),
 }
+"""The classical laws by their name in the thesis, with the model they need."""
 COMPONENTS = ("tau", "theta_r", "theta_p", "theta_s")
 DOT_M, DOT_PX = 0.01, 2.0
 """Diameter of a dot [m], and the least one [px] that is extracted."""
@@ -470,7 +412,7 @@ CARTESIAN = ("cartesian3", "cartesian2", "trajectory")
 PLANNED: tuple[tuple[str, Profile], ...] = (("centred", "linear"), ("aside", "linear"), ("aside", "translation-first"))
 THESIS = {
     "figures": "8.13 to 8.22",
-    "classical laws": {law: known.said for law, known in CLASSICAL.items()},
+    "classical laws": "trapped or diverging (fig. 8.14)",
     "planned ways": "self-occlusion avoided, all components linear and with steep translation (figs 8.15, 8.16)",
     "centre": "leaves its straight line less at smaller gains, least with joints limited to 5°/s (fig. 8.18)",
     "control errors": "decay exponentially; theta_s starts at 180° (figs 8.19, 8.20)",
@@ -526,7 +468,7 @@ def asked() -> list[BenchmarkRun]:
     """
     arms: tuple[ArmName, ...] = ("free", "rx90")
     return [
-        *(BenchmarkRun(scene, "free", law, known.model) for scene in ASIDE_M for law, known in CLASSICAL.items()),
+        *(BenchmarkRun(scene, "free", law, model) for scene in ASIDE_M for law, (_, model) in CLASSICAL.items()),
         *(BenchmarkRun(scene, arm, law) for scene in ASIDE_M for arm in arms for law in CARTESIAN),
         *(
             BenchmarkRun("aside", "rx90", law, gain=gain, step=step)
@@ -565,7 +507,7 @@ def run_benchmark_180(*, seed: int, progress: ProgressCall, runs: list[Benchmark
         "title": TITLE,
         "noise_px": NOISE_PX,
         "rows": rows,
-        "beside_thesis": [*_classical(rows), *ways, _overlap(tasks["aside"], known, seed)],
+        "beside_thesis": [*ways, _overlap(tasks["aside"], known, seed)],
         "thesis": THESIS,
         "assumptions": ASSUMPTIONS,
         "not_placed": [scene for scene in ASIDE_M if known.get((scene, "rx90", "projective"), 0) is None],
@@ -652,22 +594,6 @@ def _centre_px(poses: FloatArray) -> FloatArray:
     """Left image (k, 2) of the plate's centre."""
     x = poses[:, :, 3] @ MATRICES[0].T
     return np.asarray(x[:, :2] / x[:, 2:])
-
-
-def _classical(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Outcome of the classical laws as text, beside the thesis's."""
-    return [
-        {
-            "law": row["law"],
-            "scene": row["scene"],
-            "ours": f"{'converges' if row['reason'] in ('', 'BACK_FACE', 'OUT_OF_VIEW') else row['reason']}; "
-            f"{'face visible' if row['face_visible'] else 'shows the back'}; to {row['farthest_m']:.1f} m; "
-            f"stalled {row['stalled_s']:.1f} s; {row['iterations']} iterations",
-            "thesis": CLASSICAL[row["law"]].said,
-        }
-        for row in rows
-        if row["law"] in CLASSICAL
-    ]
 
 
 def _planned(scene: str, task: AlignmentTask, calibration: TaskCalibration | None, profile: Profile) -> dict[str, Any]:

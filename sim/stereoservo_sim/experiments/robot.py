@@ -98,7 +98,7 @@ ASSUMPTIONS = [
     f"cameras {BASELINE} m apart, both looking at the plate {DISTANCE} m away; 4 dots at the corners of 10 cm",
     f"noise of {SIGMA} px an axis in every dot's centre; joint angles exact",
     f"implied: the same with {IMPLIED_SIGMA} px, from the mean of table 5.1 with free points, and the baseline of 8.6, "
-    f"{IMPLIED_BASELINE} m",
+    f"{IMPLIED_BASELINE} m; 8.6 has the cameras 1 m away, from where these strokes leave the images",
     f"home {list(HOME_DEG)} deg, strokes of plus and minus {list(STROKES_DEG)} deg, {STOPS} stops each",
     f"joints 1 to 5 are driven {len(PLATE_TURNS_DEG)} times, the last joint at {list(PLATE_TURNS_DEG)} deg from home",
     "link 3 is read as the offset from axis 3 to the wrist along axis 4, axes 4, 6 as their distance along axis 5",
@@ -497,7 +497,7 @@ REFERENCES = {
 def compare_robot(answer: dict[str, Any]) -> list[Comparison]:
     """Tables 5.1 to 5.4 beside our errors with the noise and the baseline implied by the thesis."""
     implied, seeds = answer["implied"], answer["seeds"]
-    setting = f"{implied['sigma_px']:g} px, baseline {100 * implied['baseline_m']:.0f} cm"
+    setting = f"{implied['sigma_px']:g} px, baseline {100 * implied['baseline_m']:.0f} cm, {DISTANCE:g} m away"
     found = [
         not_comparable(
             "figs 5.14, 5.15", "tracks of the markers in the images", "plotted", "drawn", "the thesis prints no values"

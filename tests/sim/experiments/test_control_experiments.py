@@ -34,7 +34,7 @@ def rows_of(answer, **conditions):
 
 @pytest.fixture(scope="module")
 def half_turn():
-    classical = [BenchmarkRun("centred", "free", law, known.model) for law, known in CLASSICAL.items()]
+    classical = [BenchmarkRun("centred", "free", law, model) for law, (_, model) in CLASSICAL.items()]
     cartesian = [BenchmarkRun("aside", "free", law) for law in CARTESIAN]
     steps = [BenchmarkRun("aside", "free", law, step="first order") for law in CARTESIAN[:2]]
     return run_benchmark_180(seed=0, progress=silent, runs=[*classical, *cartesian, *steps, COMPARED[1]])
