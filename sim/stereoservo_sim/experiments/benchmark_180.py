@@ -189,7 +189,7 @@ def _curves_compared(rows: list[Curve], summary: list[Curve], curves: list[Curve
         of_statement("fig. 8.20", "projective beside Euclidean model", "almost perfect overlap of the angles",
                      f"{angle:.2g}° apart at most", "0.5° at most", angle < 0.5),
         of_statement("fig. 8.20", "tau, normalised to 100, beside Euclidean truth", "differs by its scale only",
-                     f"{tau:.2g} of 100 apart at most; scale {overlap['tau_scale']:.2g}", "1 of 100 at most", tau < 1.0),
+                     f"{tau:.2g} of 100 apart at most, scale {overlap['tau_scale']:.2g}", "1 of 100 at most", tau < 1),
         of_statement("fig. 8.21", "errors of the markers' images", "neither exponential nor monotonic",
                      f"they rise by {max(rises):.0f} px on the path", "a rise of 10 px or more", max(rises) > 10.0),
         of_statement("fig. 8.21", "zero line: image of the centre's path", "straight and horizontal",
