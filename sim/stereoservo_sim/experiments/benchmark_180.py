@@ -83,8 +83,10 @@ def compare_benchmark_180(answer: dict[str, Any]) -> list[Comparison]:
 def _classical_compared(row: Curve) -> Comparison:
     """A run of a classical law (fig. 8.14)."""
     lost = row["reason"] == "EXTRACTION_LOST"
-    ours = f"{'keeps the face' if row['face_visible'] else 'shows the back'}, stalled {row['stalled_s']:.1f} s, "
-    ours += f"lost {row['farthest_m']:.1f} m away" if lost else f"{row['final_error_px']:.2g} px at the end"
+    end = f"lost {row['farthest_m']:.1f} m away"
+    if not lost:
+        end = f"stalled {row['stalled_s']:.1f} s, {row['final_error_px']:.2g} px at the end"
+    ours = f"{'keeps the face' if row['face_visible'] else 'shows the back'}, {end}"
     said, criterion = "self-occlusion, trapped, escapes, converges", "it shows the back, stalls for 1 s and converges"
     seen = not lost and not row["face_visible"] and row["final_error_px"] < 1.0 and row["stalled_s"] > 1.0
     why = f"it is not trapped: its image error never falls at less than {SLOW:g} of the gain, as the centre moves too"

@@ -175,9 +175,10 @@ def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
     found = []
     for row in answer["rows"]:
         if row["head"] == "calibrated":
+            within = float(chi2.cdf((row["thesis_better_than_deg"] / row["bound_deg"]) ** 2, 1)) ** answer["trials"]
             why = (
-                f"{row['above_it']} of {row['homings']} are above it; the bound of the rms is {row['bound_deg']:.4f}°, "
-                f"so that no estimator keeps all of {TRIALS} below it at this noise"
+                f"{row['above_it']} of {row['homings']} are above it; at the bound of the rms, {row['bound_deg']:.4f}°, "
+                f"all of {answer['trials']} stay below it with a probability of {within:.2g}"
             )
             what = f"{row['joint']}, largest error of {answer['trials']} trials, median over heads"
             largest = row["largest_deg_by_seed"]["median"]

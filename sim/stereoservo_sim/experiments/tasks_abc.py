@@ -421,7 +421,7 @@ def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
         own = ends(name, "projective")
         reached = [row["gain"] for row in own if row["converged"]]
         asked = [row["gain"] for row in own]
-        told = f"at gains {', '.join(f'{gain:g}' for gain in reached)}, {len(reached)} of {len(asked)}"
+        told = f"at {len(reached)} of {len(asked)} gains: {', '.join(f'{gain:g}' for gain in reached)}"
         criterion = "every gain; by construction: poses are drawn until the exact law solves them"
         found.append(
             of_statement(

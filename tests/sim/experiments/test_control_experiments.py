@@ -15,6 +15,7 @@ from stereoservo_sim.experiments.benchmark_180 import (
     COMPARED,
     BenchmarkRun,
     benchmark_task,
+    distances_from_track,
     placed_rx90,
     run_benchmark_180,
 )
@@ -57,6 +58,11 @@ def test_a_way_there_and_back_is_longer_than_straight():
     poses[:, 0, 3] = 0.0, 0.2, 0.1
     assert path_ratio(poses[[0, 2]]) == pytest.approx(1.0)
     assert path_ratio(poses) == pytest.approx(3.0, rel=0.1)  # the cameras look slantwise
+
+
+def test_distances_from_a_track_are_those_from_its_segments():
+    points = np.array([[0.5, 0.2], [2.0, 1.0], [-3.0, 4.0]])
+    np.testing.assert_allclose(distances_from_track(points, np.array([[0.0, 0.0], [1.0, 0.0]])), [0.2, np.sqrt(2), 5.0])
 
 
 def test_benchmark_is_half_a_turn_of_a_tilted_face_that_both_cameras_see():
@@ -112,6 +118,7 @@ def test_projective_and_metric_model_overlap_and_planned_ways_keep_the_face(half
     (overlap,) = [item for item in half_turn["beside_thesis"] if "overlap" in item]
     assert overlap["theta_r_apart_deg"] < 0.5
     assert overlap["tau_apart_of_100"] < 0.5
+    assert overlap["tau_from_truth_of_100"] < 0.5
     ways = [item for item in half_turn["beside_thesis"] if "planned" in item]
     assert len(ways) == 3
     for way in ways:
