@@ -175,14 +175,15 @@ def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
     found = []
     for row in answer["rows"]:
         if row["head"] == "calibrated":
-            within = float(chi2.cdf((row["thesis_better_than_deg"] / row["bound_deg"]) ** 2, 1)) ** answer["trials"]
+            limit = row["thesis_better_than_deg"]
+            within = float(chi2.cdf((limit / row["bound_deg"]) ** 2, 1)) ** answer["trials"]
             why = (
                 f"{row['above_it']} of {row['homings']} are above it; at the bound of the rms, {row['bound_deg']:.4f}°, "
                 f"all of {answer['trials']} stay below it with a probability of {within:.2g}"
             )
             what = f"{row['joint']}, largest error of {answer['trials']} trials, median over heads"
             largest = row["largest_deg_by_seed"]["median"]
-            found.append(of_limit("fig. 4.10", what, row["thesis_better_than_deg"], largest, "°", why, "better than"))
+            found.append(of_limit("fig. 4.10", what, limit, largest, "°", why, "better than"))
     return found
 
 
