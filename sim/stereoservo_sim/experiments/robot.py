@@ -518,7 +518,8 @@ def compare_robot(answer: dict[str, Any]) -> list[Comparison]:
             what, values = f"{what}, error", (row["thesis_error"], row["rms_error"])
             why = f"{REFERENCES[row['table']]}; ours: rms of {seeds} seeds against the simulation's truth"
             why += f", larger; its bound is {bound:.2g} {unit} at {setting}" * (values[1] > values[0])
-        found.append(not_comparable(item, what, *(f"{value:.4g} {unit}" for value in values), why))
+        thesis, ours = (f"{value:.4g} {unit}" for value in values)
+        found.append(not_comparable(item, what, thesis, ours, why))
     return found
 
 
