@@ -422,7 +422,7 @@ def compare_tasks_abc(answer: dict[str, Any]) -> list[Comparison]:
         reached = [row["gain"] for row in own if row["converged"]]
         asked = [row["gain"] for row in own]
         told = f"at {len(reached)} of {len(asked)} gains: {', '.join(f'{gain:g}' for gain in reached)}"
-        criterion = "every gain; by construction: poses are drawn until the exact law solves them"
+        criterion = "every gain; by construction: poses are drawn until the law solves them with an exact model"
         found.append(
             of_statement(
                 "fig. 8.6", f"task {name}, projective", "realized successfully", told, criterion, reached == asked
