@@ -178,8 +178,8 @@ def compare_homing(answer: dict[str, Any]) -> list[Comparison]:
             limit = row["thesis_better_than_deg"]
             within = float(chi2.cdf((limit / row["bound_deg"]) ** 2, 1)) ** answer["trials"]
             why = (
-                f"{row['above_it']} of {row['homings']} are above it; at the bound of the rms, {row['bound_deg']:.4f}°, "
-                f"all of {answer['trials']} stay below it with a probability of {within:.2g}"
+                f"{row['above_it']} of {row['homings']} are above it; at the rms's bound, {row['bound_deg']:.4f}°,"
+                f" all of {answer['trials']} stay below it with a probability of {within:.2g}"
             )
             what = f"{row['joint']}, largest error of {answer['trials']} trials, median over heads"
             largest = row["largest_deg_by_seed"]["median"]
