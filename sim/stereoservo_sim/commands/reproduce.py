@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 
 from stereoservo_sim.experiments.catalogue import EXPERIMENTS, find_experiment
-from stereoservo_sim.experiments.experiment import ExperimentError, Option, show_comparisons
+from stereoservo_sim.experiments.experiment import ExperimentError, Option, show_comparisons, tally_text
 from stereoservo_sim.progress import progress_bar
 
 ALL = "all"
@@ -104,7 +104,7 @@ def _all(seed: int, plot: Path | None, html: Path | None, as_json: bool, given: 
     if as_json:
         print(json.dumps(answer | ({} if html is None else {"html": str(html)}), allow_nan=False))
         return
-    console.print("all: " + ", ".join(f"{count} {verdict}" for verdict, count in answer["verdicts"].items()))
+    console.print(f"all: {tally_text(answer['verdicts'])}")
     if html is not None:
         console.print(f"wrote {html}")
 

@@ -37,13 +37,15 @@ class ThesisItem(NamedTuple):
 
 
 DRAWN = "a drawing or a photograph: nothing to measure"
+DERIVED = "derived in the thesis, which measures nothing of it; not compared here"
 CONTENTS = (
     ThesisItem("figs 1.1 to 2.16", "hand-eye coordination, cameras, frames, displacements", instead=DRAWN),
     ThesisItem("figs 3.1 to 3.4", "geometry of translations; the set-ups", instead=DRAWN),
     ThesisItem("fig. 3.5", "gripper: error over noise and number of motions", "gripper"),
     ThesisItem("fig. 3.6", "grid: single and cumulative estimates", "grid"),
     ThesisItem("fig. 3.7", "house: motion field, rectification of the grid", "house"),
-    ThesisItem("figs 4.1 to 4.7", "geometry of rotations; set-up, trajectories in a photograph", instead=DRAWN),
+    ThesisItem("figs 4.1 to 4.6", "geometry of rotations; set-up", instead=DRAWN),
+    ThesisItem("fig. 4.7", "backprojected and extracted points, of which table 4.1 is the summary", "pan-tilt"),
     ThesisItem("table 4.1", "image errors in calibration and prediction", "pan-tilt"),
     ThesisItem("fig. 4.8", "histograms of the calibration errors", "pan-tilt"),
     ThesisItem("fig. 4.9", "feed-forward prediction over 35 trials", "pan-tilt"),
@@ -55,9 +57,13 @@ CONTENTS = (
     ThesisItem("table 5.2", "intrinsic parameters", "robot"),
     ThesisItem("table 5.3", "angles between axes", "robot"),
     ThesisItem("table 5.4", "link lengths", "robot"),
-    ThesisItem("figs 6.1 to 6.7", "inverse kinematics: drawings; its solutions are counted", "inverse-kinematics"),
-    ThesisItem("figs 7.1 to 7.13", "tasks, Cartesian motions, visibility", instead=DRAWN),
-    ThesisItem("table 8.1, figs 8.1 to 8.5", "hand-eye beside base-eye, block schemas, set-points", instead=DRAWN),
+    ThesisItem("figs 6.1 to 6.7", "inverse kinematics, derived", "inverse-kinematics"),
+    ThesisItem("6.8", "refinement of the algebraic solution on image points", instead=DERIVED),
+    ThesisItem("figs 7.1 to 7.13", "tasks, Cartesian motions, visibility", instead=f"{DERIVED}; its paths: fig. 8.15"),
+    ThesisItem("table 8.1, figs 8.1 to 8.4", "hand-eye beside base-eye, block schemas, set-points", instead=DRAWN),
+    ThesisItem(
+        "fig. 8.5", "set-points reprojected into other images", instead="an experiment that is not repeated here"
+    ),
     ThesisItem("figs 8.6 to 8.12", "tasks A, B, C: decay, image and joint motion", "tasks-abc"),
     ThesisItem("figs 8.13 to 8.22", "the benchmark of half a turn", "benchmark-180"),
     ThesisItem("8.7, 9.3", "projective beside Euclidean modelling", "projective-vs-euclidean"),
@@ -128,7 +134,7 @@ DECLARED = (
         "every preset of mechanics at work for ten virtual minutes: what the watch says where nothing has happened",
         timed=True),
     Experiment("inverse-kinematics", 100, "inverse_kinematics",
-        "chapter 6: all solutions of every family of arms from operators alone, judged by a metric solver"),
+        "chapter 6, and three families beside it: all solutions from operators alone, judged by a metric solver"),
     Experiment("tasks-abc", 12, "tasks_abc",
         "figs 8.6 to 8.12: three alignments by image-based stereo control, projective and coarse calibration"),
     Experiment("benchmark-180", 0, "benchmark_180",

@@ -13,9 +13,11 @@ the declaration names, loaded when it runs. With NAME the experiment's name in s
 Every answer has ``experiment``, ``seed``, ``seeds`` if it takes ``--seeds``, ``rows`` and, if the thesis gives
 values, ``thesis``.
 
-A comparison is a figure of ours beside the thesis's, with a verdict of one word. Our error is compared with the
-thesis's, never with the bound of an error; a bound is a reason if no estimator can do better. An error is ``better`` or
-``worse`` beyond a quarter of the thesis's own, else it ``agrees``.
+A comparison is a value or statement at a place of the thesis (table, figure, section) beside ours, with the criterion
+and a verdict of one word. Our error is compared with the thesis's, never with the bound of an error; a bound is
+a reason if no estimator can do better. Quantities are compared only if they are the same: an error against the
+simulation's truth beside a difference of two measurements is `not_comparable`. Every verdict but ``agrees`` has
+a reason; tests find a row whose verdict changes, and its reason is then written.
 """
 
 from __future__ import annotations
@@ -37,75 +39,73 @@ from stereoservo_sim.progress import ProgressCall
 
 Case = TypeVar("Case")
 Condition = TypeVar("Condition")
-Verdict = Literal["agrees", "better", "worse", "not comparable", "not reproduced"]
+Verdict = Literal["agrees", "better", "worse", "not reproduced", "not comparable", "derived"]
 MEANINGS: dict[Verdict, str] = {
-    "agrees": "an error within a quarter of the thesis's, within a limit that it states, or what it saw is seen again",
+    "agrees": "the row's criterion is met",
     "better": "an error of ours at least a fifth smaller than the thesis's",
     "worse": "an error of ours more than a quarter larger than the thesis's, or above a limit that it states",
-    "not comparable": "the thesis gives a value of another thing, or too little to compare with",
-    "not reproduced": "what the thesis saw is not what is seen here",
+    "not reproduced": "what the thesis saw is not seen here",
+    "not comparable": "the quantity is another one, simulated images beside real ones for instance, or the thesis "
+    "prints no value",
+    "derived": "the thesis derives it and measures nothing; it is confirmed here",
 }
 MARGIN = 1.25
 """Largest ratio of errors, to either side, that still agrees."""
 
 
 class Comparison(NamedTuple):
-    """A row: ``item`` of the thesis (table, figure, section), ``what`` is compared, both values as text, the verdict
-    and its reason.
+    """A row: ``item`` of the thesis (table, figure, section), ``what`` is compared, both values as text, the criterion
+    of agreement, the verdict and its reason.
     """
 
     item: str
     what: str
     thesis: str
     ours: str
+    criterion: str
     verdict: Verdict
-    why: str = ""
+    why: str
 
 
-def of_error(
-    item: str, what: str, thesis: float | None, ours: float | None, unit: str, why: str = "", lost: str = ""
-) -> Comparison:
-    """Comparison of two errors [unit]; ``why``: the reason if ours is not ``better``, ``lost``: if there is none."""
-    if thesis is None or ours is None:
-        return Comparison(item, what, _text(thesis, unit), _text(ours, unit), "not comparable", lost)
-    verdict: Verdict = "agrees"
-    if ours > MARGIN * thesis:
-        verdict = "worse"
-    elif MARGIN * ours < thesis:
-        verdict = "better"
-    return Comparison(item, what, _text(thesis, unit), _text(ours, unit), verdict, why if verdict == "worse" else "")
+COLUMNS = ("thesis", "what", "its value", "ours", "agrees if", "verdict", "why")
+"""Titles of a comparison's columns."""
+
+
+def of_error(item: str, what: str, thesis: float, ours: float, unit: str, why: str) -> Comparison:
+    """Comparison of two errors [unit] of the same quantity; ``why``: the reason if they do not agree."""
+    verdict: Verdict = "worse" if ours > MARGIN * thesis else "better" if MARGIN * ours < thesis else "agrees"
+    values = f"{thesis:.4g} {unit}", f"{ours:.4g} {unit}"
+    return Comparison(item, what, *values, "within a quarter", verdict, "" if verdict == "agrees" else why)
 
 
 def of_limit(
-    item: str, what: str, limit: float, ours: float | None, unit: str, why: str = "", said: str = "below"
+    item: str, what: str, limit: float, ours: float, unit: str, why: str = "", said: str = "below"
 ) -> Comparison:
     """Comparison of our error [unit] with the limit stated in the thesis; ``why``: the reason if it is exceeded."""
-    if ours is None:
-        return Comparison(item, what, f"{said} {_text(limit, unit)}".strip(), "-", "not reproduced", why)
-    held = ours <= limit
-    return Comparison(
-        item,
-        what,
-        f"{said} {_text(limit, unit)}".strip(),
-        _text(ours, unit),
-        "agrees" if held else "worse",
-        "" if held else why,
-    )
+    held, stated = ours <= limit, f"{limit:.4g} {unit}"
+    values = f"{said} {stated}".strip(), f"{ours:.4g} {unit}"
+    return Comparison(item, what, *values, f"at most {stated}", "agrees" if held else "worse", "" if held else why)
 
 
-def of_statement(item: str, what: str, thesis: str, ours: str, seen: bool, why: str = "") -> Comparison:
+def of_statement(item: str, what: str, thesis: str, ours: str, criterion: str, seen: bool, why: str = "") -> Comparison:
     """Comparison of an observation of the thesis with ``seen`` here; ``why``: the reason if it is not seen."""
-    return Comparison(item, what, thesis, ours, "agrees" if seen else "not reproduced", "" if seen else why)
+    return Comparison(item, what, thesis, ours, criterion, "agrees" if seen else "not reproduced", "" if seen else why)
 
 
-def tally(comparisons: Iterable[Comparison]) -> dict[str, int]:
+def not_comparable(item: str, what: str, thesis: str, ours: str, why: str) -> Comparison:
+    """Values of two quantities, or ours without one of the thesis; ``why``: how they differ."""
+    return Comparison(item, what, thesis, ours, "-", "not comparable", why)
+
+
+def tally(verdicts: Iterable[Verdict]) -> dict[Verdict, int]:
     """Number of rows with each verdict, in the order of their meanings."""
-    counts = Counter(row.verdict for row in comparisons)
+    counts = Counter(verdicts)
     return {verdict: counts[verdict] for verdict in MEANINGS}
 
 
-def _text(value: float | None, unit: str) -> str:
-    return "-" if value is None else f"{value:.4g} {unit}".strip()
+def tally_text(counts: dict[Verdict, int]) -> str:
+    """A tally as printed: ``135 rows: 60 agrees, …``."""
+    return f"{sum(counts.values())} rows: " + ", ".join(f"{n} {verdict}" for verdict, n in counts.items() if n)
 
 
 LISTED, WIDEST = 200, 400
@@ -330,14 +330,13 @@ def show_comparisons(compared: list[Comparison], console: Console) -> None:
     whole_table(
         console,
         "beside the thesis",
-        dict.fromkeys(("thesis", "what", "its value", "ours", "verdict"), "left"),
-        [[row.item, row.what, row.thesis, row.ours, row.verdict] for row in compared],
+        dict.fromkeys(COLUMNS[:-1], "left"),
+        [list(row[:-1]) for row in compared],
     )
     for row in compared:
         if row.why:
             console.print(f"{row.item}, {row.what}: {row.verdict}: {row.why}")
-    counted = ", ".join(f"{count} {verdict}" for verdict, count in tally(compared).items() if count)
-    console.print(f"verdicts: {counted}")
+    console.print(f"verdicts: {tally_text(tally(row.verdict for row in compared))}")
 
 
 def cell_text(value: Any) -> str:

@@ -41,7 +41,7 @@ from stereoservo_sim.experiments.affine_measures import (
     rows_of,
     upgrade,
 )
-from stereoservo_sim.experiments.experiment import Comparison, of_error, of_limit, of_statement
+from stereoservo_sim.experiments.experiment import Comparison, not_comparable, of_limit, of_statement
 from stereoservo_sim.experiments.figures import COLOURS, Figures, labelled, picture
 from stereoservo_sim.experiments.textured import (
     Face,
@@ -281,6 +281,12 @@ def _bounds(rig: StereoRig, scenes: FloatArray) -> dict[tuple[str, int, str], fl
     return bounds
 
 
+BUNDLED = (
+    "the thesis upgrades a projective reconstruction of real images afterwards (3.3); ours is a bundle over 18 "
+    "simulated stereo images"
+)
+
+
 def compare_grid(answer: dict[str, Any]) -> list[Comparison]:
     """Fig. 3.6 beside our medians."""
     rows = {(r["estimate"], r["motion"], r["method"], r["structure"]): r["e_d_mm"] for r in answer["rows"]}
@@ -297,32 +303,32 @@ def compare_grid(answer: dict[str, Any]) -> list[Comparison]:
     rejected = rows["5 of 17 spoilt, rejected", last, "non-linear", "full"]["p84"]
     return [
         of_statement("fig. 3.6", "absolute error, cumulative; structure of one stereo image",
-                     f"{low:g} to {high:g} mm", f"{one:.2g} mm", low <= one <= high,
+                     f"{low:g} to {high:g} mm", f"{one:.2g} mm", f"{low:g} to {high:g} mm", low <= one <= high,
                      "the noise and the distance are assumed"),
-        of_error("fig. 3.6", "absolute error, cumulative; structure of all images", low,
-                 median("cumulative", last, "non-linear", "full"), "mm"),
+        not_comparable("fig. 3.6", "absolute error, cumulative; structure of all images", f"{low:g} to {high:g} mm",
+                       f"{median('cumulative', last, 'non-linear', 'full'):.2g} mm", BUNDLED),
         *_compared_pictures(answer["rendered"], low, high),
         of_statement("fig. 3.6", "linear beside non-linear", "no real difference",
-                     f"errors by the plane {planes[0]:.2g} and {planes[1]:.2g} mm, below the {one:.2g} mm of one "
-                     "stereo image", max(planes) < 0.1 * one),
+                     f"errors by the plane {planes[0]:.2g} and {planes[1]:.2g} mm, of one stereo image {one:.2g} mm",
+                     "errors by the plane below a tenth of that of one stereo image", max(planes) < 0.1 * one),
         of_statement("fig. 3.6", "motions along the optical axis, 6 to 11", "less accurate",
                      f"{min(along):.2g} to {max(along):.2g} mm, others {min(across):.2g} to {max(across):.2g} mm",
-                     min(along) > max(across)),
+                     "each less accurate than every other motion", min(along) > max(across)),
         of_statement("fig. 3.6", "corrupted data, mismatches", "robust",
-                     f"5 of 17 motions spoilt: {rejected:.2g} mm", rejected < high),
+                     f"5 of 17 motions spoilt: {rejected:.2g} mm", f"at most {high:g} mm", rejected < high),
     ]  # fmt: skip
 
 
 def _compared_pictures(rendered: list[dict[str, Any]], low: float, high: float) -> list[Comparison]:
     """The errors with rendered images, the largest of all sequences."""
     rms = max(one["rms_px"] for one in rendered)
-    one = max(sequence["one_image_e_d_mm"] for sequence in rendered)
-    said = f"through pictures, corners to {rms:.2g} px, F estimated"
+    one, every = (max(sequence[f"{name}_e_d_mm"] for sequence in rendered) for name in ("one_image", "all_images"))
     return [
         of_statement("fig. 3.6", "rendered, structure of one stereo image", f"{low:g} to {high:g} mm",
-                     f"{one:.2g} mm {said}", low <= one <= high, "the finder's error decides"),
-        of_error("fig. 3.6", "rendered, structure of all images", low,
-                 max(sequence["all_images_e_d_mm"] for sequence in rendered), "mm"),
+                     f"{one:.2g} mm through pictures, corners to {rms:.2g} px, F estimated",
+                     f"{low:g} to {high:g} mm", low <= one <= high, "the finder's error decides"),
+        not_comparable("fig. 3.6", "rendered, structure of all images", f"{low:g} to {high:g} mm", f"{every:.2g} mm",
+                       BUNDLED),
     ]  # fmt: skip
 
 
@@ -474,7 +480,8 @@ def run_house(*, seeds: int, seed: int, progress: ProgressCall, pictures: bool =
         }
         for (sigma, n, method, structure), errors in sorted(values.items())
     ]
-    return {**answer_of(rows, HOUSE_THESIS, HOUSE_ASSUMPTIONS), "rendered": rendered}
+    grid = _expected(X, np.zeros((3, 3)), seen)["full"]
+    return {**answer_of(rows, HOUSE_THESIS, HOUSE_ASSUMPTIONS), "rendered": rendered, "grid_e_d_mm": grid}
 
 
 def _expected(X: FloatArray, plane: FloatArray, seen: FloatArray) -> dict[str, float]:
@@ -493,15 +500,21 @@ def compare_house(answer: dict[str, Any]) -> list[Comparison]:
         )
         for method in ("linear", "non-linear")
     }
-    limit = HOUSE_THESIS["e_d_mm_below"]
+    limit, grid = HOUSE_THESIS["e_d_mm_below"], answer["grid_e_d_mm"]
+    least = min(
+        row["e_d_mm"]["median"] for row in answer["rows"] if (row["method"], row["structure"]) == ("non-linear", "full")
+    )
     return [
         of_limit("fig. 3.7", f"e_D on the grid, non-linear, largest median to {SIGMAS[-1]:g} px", limit,
                  worst["non-linear"], "mm"),
-        of_limit("fig. 3.7", "e_D on the grid, rendered: points, matches and F by the detector", limit,
-                 max((one["e_d_mm"] for one in answer["rendered"]), default=None), "mm"),
+        *(of_limit("fig. 3.7", "e_D on the grid, rendered: points, matches and F by the detector", limit,
+                   one["e_d_mm"], "mm") for one in answer["rendered"]),
         of_statement("fig. 3.7", "linear estimate", f"the limit of {limit:g} mm needs the non-linear one",
                      f"to {worst['linear']:.2g} mm, non-linear {worst['non-linear']:.2g} mm",
-                     worst["linear"] > limit),
+                     f"linear above {limit:g} mm", worst["linear"] > limit),
+        of_statement("3.3.3", "e_D beside that of fig. 3.6", "slightly higher",
+                     f"medians {least:.3g} to {worst['non-linear']:.2g} mm; {grid:.3g} mm with the plane known",
+                     f"above that, at most {limit:g} mm", grid < least <= worst["non-linear"] <= limit),
     ]  # fmt: skip
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from stereoservo_sim.experiments.catalogue import CONTENTS, REPRODUCED, find_experiment
-from stereoservo_sim.experiments.experiment import MEANINGS, Comparison, Experiment, cell_text, tally
+from stereoservo_sim.experiments.experiment import COLUMNS, MEANINGS, Comparison, Experiment, Verdict, cell_text, tally
 from stereoservo_sim.progress import ProgressCall
 
 
@@ -45,14 +45,17 @@ def reproduce_all(
 
 def answer_of_all(found: list[Reproduction], seed: int) -> dict[str, Any]:
     """The JSON object of ``reproduce all``."""
-    compared = [row for one in found for row in one.compared]
     return {
         "experiment": "all",
         "seed": seed,
         "rows": [{"experiment": one.experiment.name, **row._asdict()} for one in found for row in one.compared],
-        "verdicts": tally(compared),
+        "verdicts": _tally(found),
         "thesis": {item.number: item.experiment or item.instead for item in CONTENTS},
     }
+
+
+def _tally(found: list[Reproduction]) -> dict[Verdict, int]:
+    return tally(row.verdict for one in found for row in one.compared)
 
 
 STYLE = """
@@ -62,15 +65,16 @@ table { border-collapse: collapse; margin: .6rem 0; display: block; overflow-x: 
 th, td { border: 1px solid var(--line); padding: .2rem .5rem; text-align: left; vertical-align: top; }
 th { background: var(--soft); }
 img { max-width: 100%; height: auto; background: white; }
-.agrees, .better { color: #197a35; } .worse, .not-reproduced { color: #b3261e; font-weight: 600; }
-@media (prefers-color-scheme: dark) { .agrees, .better { color: #6fd08b; } .worse, .not-reproduced { color: #ff8a80; } }
+.agrees, .better, .derived { color: #197a35; } .worse, .not-reproduced { color: #b3261e; font-weight: 600; }
+@media (prefers-color-scheme: dark) {
+.agrees, .better, .derived { color: #6fd08b; } .worse, .not-reproduced { color: #ff8a80; }
+}
 """
 
 
 def page(found: list[Reproduction], seed: int) -> str:
     """HTML page of all results (one file: images embedded, no external resources)."""
-    compared = [row for one in found for row in one.compared]
-    counts = tally(compared)
+    counts = _tally(found)
     parts = [
         "<!doctype html><html lang=en><head><meta charset=utf-8>",
         '<meta name=viewport content="width=device-width, initial-scale=1">',
@@ -103,10 +107,7 @@ def _contents_line(item: Any, found: list[Reproduction]) -> tuple[str, str, str]
 def _section(one: Reproduction) -> str:
     """One experiment: verdicts, figures, its rows, its assumptions."""
     name = one.experiment.name
-    rows = [
-        (escape(r.item), escape(r.what), escape(r.thesis), escape(r.ours), _word(r.verdict), escape(r.why))
-        for r in one.compared
-    ]
+    rows = [(*map(escape, row[:5]), _word(row.verdict), escape(row.why)) for row in one.compared]
     figures = [
         f'<figure><img alt="{escape(file)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
         f"<figcaption>{escape(Path(file).stem.replace('-', ' '))}</figcaption></figure>"
@@ -116,7 +117,7 @@ def _section(one: Reproduction) -> str:
     return "\n".join(
         [
             f"<h2 id={name}>{name}</h2><p>{escape(one.experiment.summary)}</p>",
-            _table(("thesis", "what", "its value", "ours", "verdict", "why"), rows),
+            _table(COLUMNS, rows),
             *figures,
             *(
                 f"<details><summary>{escape(title)}</summary>{_rows_table(listed)}</details>"
