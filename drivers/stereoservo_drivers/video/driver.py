@@ -27,7 +27,15 @@ from stereoservo_drivers.episodes import episode_of, refused
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decode_video_options, frozen_frames
-from stereoservo_drivers.video.pictures import PICTURE_FLAG, StreamMonitor, check_size, jpeg_size, one_channel
+from stereoservo_drivers.video.pictures import (
+    JPEG,
+    PICTURE_FLAG,
+    PNG,
+    StreamMonitor,
+    check_size,
+    one_channel,
+    picture_size,
+)
 from stereoservo_drivers.video.server_clock import ServerClock
 from stereoservo_drivers.video.sources import CaptureSource, GenicamSource, LiveSource, Settings, SourcePicture
 
@@ -104,8 +112,8 @@ class Playback:
 
     def _seen(self, coming: Frame) -> Frame | None:
         """The frame to deliver; None if it repeats the last image."""
-        image = one_channel(coming.image, self._options.channel, self._options.flip)
         watch = self._watch
+        image = one_channel(watch.eight_bits(coming.image), self._options.channel, self._options.flip)
         if not watch.see(image, coming.t_received_ns, coming.seq, 0, look=self._look > 0):
             if watch.row >= self._look:
                 self._error = self._place.error(
@@ -350,9 +358,9 @@ class NumberedPictures:
                 "frame_too_large", f"{path.name} has {size} bytes; at most {LARGEST_PICTURE} are read", frame=number
             )
         data = path.read_bytes()
-        if path.suffix.lower() not in (".jpg", ".jpeg") or jpeg_size(data) is not None:
+        if not data.startswith((JPEG, PNG)) or picture_size(data) is not None:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), PICTURE_FLAG)
-        if image is None:
+        if image is None or image.dtype not in (np.uint8, np.uint16):
             raise self._place.error(
                 "corrupt", f"{path.name} is no whole picture: cut off, damaged, or of another kind", frame=number
             )
@@ -862,7 +870,7 @@ class Reader:
     def _keep(self, picture: SourcePicture) -> None:
         options = self._options
         check_size(self._place, options, picture.image.shape[1], picture.image.shape[0])
-        image = one_channel(picture.image, options.channel, options.flip)
+        image = one_channel(self._watch.eight_bits(picture.image), options.channel, options.flip)
         with self._changed:
             if self._ending:  # closed meanwhile; another reader may use the watch
                 return
