@@ -195,6 +195,8 @@ class MjpegSource:
                     return self._damaged(error)
             parts = self._awaited()
             whole = [part for part in parts if not part.cut] or parts[-1:]
+            if not whole and not self._over:
+                return None
             if whole:
                 picture = self._decoded(whole[-1], len(whole) - 1)
                 if picture is None or self._parser.begun != 1 or self._differs(picture):
@@ -529,7 +531,7 @@ class PictureParser:
         self._picture: PictureData | None = None
         self._delimiter = b""
         self._length: int | None = None
-        self._at = 0  # the bytes before it need no second look
+        self._at = self._searched = 0  # the bytes before need no second look, or none for the boundary
         self._before_ns = 0
 
     @property
@@ -565,7 +567,7 @@ class PictureParser:
 
     def _drop(self, count: int) -> None:
         del self._buffer[:count]
-        self._at = 0
+        self._at = self._searched = 0
 
     def _find_picture(self, fresh: int, t_ns: int) -> bool:
         """Skip text up to the next picture, and read its headers. ``fresh``: bytes at the end that arrived just now."""
@@ -611,19 +613,23 @@ class PictureParser:
         return self._no_end()
 
     def _find_png_end(self) -> tuple[int, bool]:
-        """As :meth:`_find_end`; a chunk with a wrong checksum or length ends the picture as cut."""
+        """As :meth:`_find_end`: a boundary, a wrong checksum or a length beyond all bounds ends the picture as cut."""
         buffer = self._buffer
+        edge = self._delimiter if len(self._delimiter) > 5 else PNG  # shorter ones may be data
         while len(buffer) >= self._at + 8:
             at = self._at
             end = at + 12 + int.from_bytes(buffer[at : at + 4], "big")
-            if end <= self._largest and len(buffer) < end:
-                break
-            if end > self._largest or zlib.crc32(buffer[at + 4 : end - 4]).to_bytes(4, "big") != buffer[end - 4 : end]:
-                marks = [buffer.find(mark, at) for mark in (self._delimiter, PNG) if mark]
-                return min([mark for mark in marks if mark >= 0], default=len(buffer)), True
-            self._at = end
-            if buffer[at + 4 : at + 8] == b"IEND":
-                return end, False
+            whole = len(buffer) >= end
+            if whole and zlib.crc32(buffer[at + 4 : end - 4]).to_bytes(4, "big") == buffer[end - 4 : end]:
+                self._at = end
+                if buffer[at + 4 : at + 8] == b"IEND":
+                    return end, False
+                continue
+            cut = buffer.find(edge, max(at, self._searched))
+            self._searched = len(buffer) - len(edge) + 1
+            if cut >= 0 or whole or end > self._largest:
+                return cut if cut >= 0 else len(buffer), True
+            break
         return self._no_end()
 
     def _no_end(self) -> tuple[int, bool]:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereoservo_drivers.video.pictures import picture_size, one_channel
+from stereoservo_drivers.video.pictures import one_channel, picture_size
 
 IMAGE = np.random.default_rng(6).integers(0, 256, (48, 64, 3), np.uint8)
 SETTINGS = {

@@ -197,7 +197,7 @@ def test_a_server_that_answers_no_more_pictures_is_told():
     answers = [sized(jpeg(picture(1))), *[head("Content-Length: 0", status="404 Not Found")] * 20]
     with source_of(lambda s, _: (answers[s.requests - 1], OPEN)) as (server, source):
         source.open()
-        with pytest.raises(DriverError, match="answered 404 Not Found.*snapshot"):
+        with pytest.raises(DriverError, match=r"answered 404 Not Found.*snapshot"):
             read(source, 2)
         assert server.requests == 11
 
