@@ -479,7 +479,7 @@ class ChunkedDecoder:
             return
         digits = line.partition(b";")[0].strip()
         if not digits or len(digits) > 16 or digits.strip(b"0123456789abcdefABCDEF"):
-            raise StreamError("http", f"a chunk's size is {digits[:32]!r}; valid: hexadecimal digits")
+            raise StreamError("http", "a chunk's size is no number in hexadecimal digits")
         self._left = int(digits, 16)
         self.ended = not self._left
 

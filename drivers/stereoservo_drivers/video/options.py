@@ -12,7 +12,7 @@ from urllib.parse import SplitResult
 import msgspec
 from msgspec import Meta
 
-from stereoservo.messages.addresses import Address, AddressError, without_secrets
+from stereoservo.messages.addresses import Address, AddressError, keep_secret, without_secrets
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.episodes import EpisodeNumber
 from stereoservo_drivers.options import decode_options
@@ -100,6 +100,7 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     def __post_init__(self) -> None:
         if isinstance(self.source, str) and "://" in self.source:
+            keep_secret(self.source)
             msgspec.structs.force_setattr(self, "source", Address(self.source))
 
 

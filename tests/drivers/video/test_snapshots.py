@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 import pytest
 
+from stereoservo.messages import addresses
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import DriverError
-from stereoservo_drivers.video.driver import probed
+from stereoservo_drivers.video.driver import VideoCameraDriver, probed
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import decode_video_options
 
@@ -260,3 +261,38 @@ def test_a_login_that_is_refused_is_told_with_its_cause(asked, cause):
     assert caught.value.code == "http_status"
     assert cause in str(caught.value)
     assert "secret" not in f"{caught.value} {vars(caught.value)}"
+
+
+SECRET = "Tulpe"
+ECHOES = {
+    "reason": lambda target: head(status=f"404 no {target}"),
+    "login": lambda target: head(f'WWW-Authenticate: Digest realm="{target}", nonce="1", algorithm=X', status="401 No"),
+    "address": lambda target: head(f"Location: ftp://x{target}", status="302 Found"),
+    "same address": lambda target: head(f"Location: {target}", status="302 Found"),
+    "kind": lambda target: head(f"Content-Type: text/{target}"),
+    "kind of a part": lambda target: head() + f"--x\r\nContent-Type: {target}\r\n\r\nhi".encode(),
+    "chunk": lambda target: head("Transfer-Encoding: chunked") + f"{target}\r\n".encode(),
+    "no HTTP": lambda target: f"SSH {target}\r\n".encode(),
+}
+
+
+@pytest.mark.parametrize(
+    "planted",
+    [
+        "//me:{s}@#/shot", "//{s}@#/shot", "//:{s}@#/shot", "//me:{s}%40@#/shot", "//#/shot?token={s}",
+        "//#/shot?a=1&access_token={s}&b=2", "//#/shot?pwd={s}%21", "//#/user=operator_password={s}_channel=1",
+        "//#/shot;jsessionid={s}", "//me:other@#/shot?auth={s}",
+    ],
+)  # fmt: skip
+def test_no_secret_of_an_address_is_told_though_the_server_repeats_it(planted, context, monkeypatch):
+    monkeypatch.setattr(addresses, "_kept", {})
+    for name, answer in ECHOES.items():
+        server = SnapshotServer(lambda _, request, answer=answer: (answer(request.split()[1].decode()), CLOSED))
+        url = "http:" + planted.format(s=SECRET).replace("#", server.url.split("/")[2])
+        options = {"source": url, "width": WIDTH, "height": HEIGHT, "open_timeout_s": 30.0, "read_timeout_s": 5.0}
+        driver = VideoCameraDriver(options, context)
+        with pytest.raises(DriverError) as caught:
+            driver.configure()
+        driver.close()
+        server.close()
+        assert SECRET not in f"{caught.value} {caught.value!r} {vars(caught.value)!r}", name
