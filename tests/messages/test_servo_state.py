@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from stereoservo.messages.reasons import Reason
 from stereoservo.messages.servo_state import (
     LoopStatistics,
     Numbers,
@@ -15,7 +16,6 @@ from stereoservo.messages.servo_state import (
     silence_limit_s,
     state_message,
 )
-from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import CameraHealth, Health
 from stereoservo.messages.wire import StateMessage
 
