@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import io
 import math
 import struct
@@ -165,9 +166,9 @@ class FakeCamera:
     def __init__(self, capabilities: int) -> None:
         self.capabilities = capabilities
 
-    def __call__(self, request: int, data: bytearray) -> None:
+    def __call__(self, request: int, data: ctypes.Structure) -> None:
         kind, number = request & 0xFF, struct.unpack_from("I", data, 0)[0]
-        assert len(data) == request >> 16 & 0x3FFF
+        assert len(bytes(data)) == request >> 16 & 0x3FFF
         if kind == 0:
             struct.pack_into("I", data, 88, self.capabilities)
         elif kind == 2:

@@ -406,6 +406,24 @@ def test_a_failing_driver_is_stopped_at_once_and_faults_the_cell(bench: Bench, c
     assert bench.arm.calls.count("write_velocity") == writes
 
 
+@pytest.mark.parametrize("active", [False, True])
+@pytest.mark.parametrize(("ends", "code"), [(True, "DRIVER_FAULT"), (False, "JOINTS_STALE")])
+def test_drives_that_end_or_hang_without_a_goal_are_a_reason_within_half_a_second(
+    bench: Bench, active: bool, ends: bool, code: str
+) -> None:
+    if active:
+        enabled(bench)
+    bench.run(20)
+    assert not [reason for reason in bench.state().status.reasons if reason.level != "info"]
+    if ends:
+        bench.arm.fail["read_state"] = DriverError("connection_lost", "the plant has ended")
+    else:
+        newest = bench.arm.read_state()
+        bench.arm.read_state = lambda: newest  # type: ignore[method-assign]
+    bench.run(round(0.5 * RATE_HZ))
+    assert code in {reason.code for reason in bench.state().status.reasons}
+
+
 def test_a_faulty_driver_is_not_hammered_and_reset_reconnects_it(bench: Bench) -> None:
     enabled(bench)
     bench.arm.fail["read_state"] = DriverError("connection_lost", "gone")

@@ -148,7 +148,7 @@ def test_frames_without_a_detector_are_an_error_that_says_so(bench: Bench) -> No
         bench.pipeline.poll()
 
 
-def run(bench: Bench, seconds: float, script: dict[float, object]) -> None:
+def run(bench: Bench, seconds: float, script: dict[float, object], period_s: float = 0.0) -> None:
     """Run the pipeline for so much virtual time; at each time of ``script`` call its entry."""
     start = bench.clock.now_ns()
     waiting = sorted(script.items())
@@ -165,6 +165,7 @@ def run(bench: Bench, seconds: float, script: dict[float, object]) -> None:
             bench.clock.now_ns,
             camera="left",
             poll_s=0.002,
+            period_s=period_s,
         ),
         lambda: (bench.clock.now_ns() - start) * 1e-9 >= seconds,
         sleep=sleep,
@@ -194,6 +195,13 @@ def test_a_camera_that_falls_silent_is_opened_anew(bench: Bench) -> None:
     run(bench, 2.0 * SILENT_CAMERA_S, {})
     assert bench.reports == [("camera_lost", f"camera left: no image for {SILENT_CAMERA_S:g} s; trying again")]
     assert bench.camera.calls.count("configure") == 2
+
+
+def test_a_slow_camera_is_given_three_of_its_periods(bench: Bench) -> None:
+    run(bench, 9.5, {4.0: lambda: bench.camera.arriving.append(observation(1, 1))}, period_s=2.0)
+    assert bench.reports == []
+    run(bench, 6.5, {}, period_s=2.0)
+    assert bench.reports == [("camera_lost", "camera left: no image for 6 s; trying again")]
 
 
 @pytest.mark.parametrize("true_hz", [29.0, 30.0, 31.0, 45.0, 60.0])

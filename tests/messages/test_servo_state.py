@@ -7,6 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from stereoservo.messages.reasons import Reason
 from stereoservo.messages.servo_state import (
     LoopStatistics,
     Numbers,
@@ -46,10 +47,14 @@ class StatusOfCore:
 
 
 def message(
-    health: Health = StatusOfCore.health, *, joints_ns: int = NOW_NS, frames_ns: dict[str, int]
+    health: Health = StatusOfCore.health,
+    *,
+    joints_ns: int = NOW_NS,
+    frames_ns: dict[str, int],
+    reasons: tuple[Reason, ...] = (),
 ) -> StateMessage:
     status = StatusOfCore()
-    status.health = health
+    status.health, status.reasons = health, reasons
     loop = LoopStatistics(250.0, 9, 0, 0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     state = StateRecord(
         status,
@@ -98,3 +103,11 @@ def test_without_any_camera_nobody_knows_whether_the_model_holds(frames_ns: dict
     assert "no camera" in found.health.text
     moved = Health("camera_moved", ("fast",), text="camera fast moved")
     assert message(moved, frames_ns=frames_ns).health == moved, "what was found stays found"
+
+
+def test_dead_cameras_are_no_cause_to_clear_the_view() -> None:
+    asked = (Reason("FEATURES_STALE", "hold", hint="clear the view"), Reason("HELD", "hold", hint="resume to go on"))
+    assert message(frames_ns=BOTH, reasons=asked).reasons == asked, "frames come, and show no markers"
+    stale, held = message(frames_ns={}, reasons=asked).reasons
+    assert (stale.code, stale.level, held) == ("FEATURES_STALE", "hold", asked[1])
+    assert "no camera delivers frames" in stale.hint

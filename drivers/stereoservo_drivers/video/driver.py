@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import stat
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
@@ -27,9 +25,29 @@ from stereoservo_drivers.episodes import episode_of, refused
 from stereoservo_drivers.lifecycle import DriverLifecycle, LifecycleState
 from stereoservo_drivers.video.mjpeg import MjpegSource
 from stereoservo_drivers.video.options import DRIVER, Place, VideoOptions, decode_video_options, frozen_frames
-from stereoservo_drivers.video.pictures import PICTURE_FLAG, StreamMonitor, check_size, jpeg_size, one_channel
+from stereoservo_drivers.video.pictures import (
+    JPEG,
+    PICTURE_FLAG,
+    PNG,
+    StreamMonitor,
+    check_size,
+    one_channel,
+    picture_size,
+)
 from stereoservo_drivers.video.server_clock import ServerClock
-from stereoservo_drivers.video.sources import CaptureSource, GenicamSource, LiveSource, Settings, SourcePicture
+from stereoservo_drivers.video.sources import (
+    CAPTURE,
+    QUERY_CAPABILITY,
+    Capability,
+    CaptureSource,
+    GenicamSource,
+    Ioctl,
+    LiveSource,
+    Settings,
+    SourcePicture,
+    modes,
+    opened,
+)
 
 MOST_A_POLL = 8
 """Largest number of frames that a late poll skips: bounds its time."""
@@ -104,8 +122,8 @@ class Playback:
 
     def _seen(self, coming: Frame) -> Frame | None:
         """The frame to deliver; None if it repeats the last image."""
-        image = one_channel(coming.image, self._options.channel, self._options.flip)
         watch = self._watch
+        image = one_channel(watch.eight_bits(coming.image), self._options.channel, self._options.flip)
         if not watch.see(image, coming.t_received_ns, coming.seq, 0, look=self._look > 0):
             if watch.row >= self._look:
                 self._error = self._place.error(
@@ -350,9 +368,9 @@ class NumberedPictures:
                 "frame_too_large", f"{path.name} has {size} bytes; at most {LARGEST_PICTURE} are read", frame=number
             )
         data = path.read_bytes()
-        if path.suffix.lower() not in (".jpg", ".jpeg") or jpeg_size(data) is not None:
+        if not data.startswith((JPEG, PNG)) or picture_size(data) is not None:
             image = cv2.imdecode(np.frombuffer(data, np.uint8), PICTURE_FLAG)
-        if image is None:
+        if image is None or image.dtype not in (np.uint8, np.uint16):
             raise self._place.error(
                 "corrupt", f"{path.name} is no whole picture: cut off, damaged, or of another kind", frame=number
             )
@@ -605,12 +623,6 @@ def _again(error: DriverError) -> DriverError:
 CLASS = Path("/sys/class/video4linux")
 BY_ID = Path("/dev/v4l/by-id")
 DEVICES = Path("/dev")
-QUERYCAP, ENUM_FMT = 0x80685600, 0xC0405602
-ENUM_FRAMESIZES, ENUM_FRAMEINTERVALS = 0xC02C564A, 0xC034564B
-"""Requests of Linux' videodev2.h; the size of the structure is part of them."""
-CAPTURE = 1
-"""``V4L2_BUF_TYPE_VIDEO_CAPTURE``, and ``V4L2_CAP_VIDEO_CAPTURE``."""
-DISCRETE = 1
 LARGEST_PIXELS = 2_000_000
 """Larger pictures cost more time than they are worth, and are not proposed first."""
 LEAST_RATE_HZ = 10.0
@@ -618,8 +630,6 @@ PROBED_PICTURES = 12
 USUAL_RATES = (5.0, 7.5, 10.0, 15.0, 20.0, 24.0, 25.0, 30.0, 50.0, 60.0, 90.0, 100.0, 120.0)
 NEAR = 0.12
 
-Ioctl = Callable[[int, bytearray], None]
-"""Fills a structure by a request; raises OSError at the end of the list."""
 Mode = tuple[int, int, float]
 
 
@@ -641,73 +651,35 @@ def found_cameras(
     found = []
     for node in sorted(directory.glob("video*"), key=lambda path: (len(path.name), path.name)):
         device = devices / node.name
-        modes = asked(device)
-        if modes is None:
+        listed = asked(device)
+        if listed is None:
             continue
         try:
             name = (node / "name").read_text(encoding="utf-8", errors="replace").strip()
         except OSError:
             name = "camera"
         path = stable.get(os.path.realpath(device), device)
-        found.append(FoundCamera(f"{name} ({device})", {"source": str(path)}, modes))
+        found.append(FoundCamera(f"{name} ({device})", {"source": str(path)}, listed))
     return tuple(found)
 
 
 def device_modes(device: Path) -> tuple[Mode, ...] | None:
     """Modes of a V4L2 device, best first; None if it cannot be opened or captures no pictures."""
     try:
-        descriptor = os.open(device, os.O_RDWR | os.O_NONBLOCK | os.O_CLOEXEC)
+        with opened(str(device)) as ioctl:
+            return modes_told(ioctl)
     except OSError:
         return None
-    try:
-        return modes_told(lambda request, data: fcntl.ioctl(descriptor, request, data, True) and None)
-    finally:
-        os.close(descriptor)
 
 
 def modes_told(ioctl: Ioctl) -> tuple[Mode, ...] | None:
-    """Modes that a device reports by V4L2's requests, best first; None if it captures no pictures."""
-    about = bytearray(104)
-    try:
-        ioctl(QUERYCAP, about)
-    except OSError:
+    """Modes that a device reports, best first; None if it captures no pictures. Raises OSError."""
+    about = Capability()
+    ioctl(QUERY_CAPABILITY, about)
+    if not about.device_caps & CAPTURE:
         return None
-    if not struct.unpack_from("I", about, 88)[0] & CAPTURE:
-        return None
-    modes = set()
-    for form in _listed(ioctl, ENUM_FMT, 64, lambda k, data: struct.pack_into("II", data, 0, k, CAPTURE)):
-        pixel_format = struct.unpack_from("I", form, 44)[0]
-
-        def sizes(k: int, data: bytearray, code: int = pixel_format) -> None:
-            struct.pack_into("II", data, 0, k, code)
-
-        for size in _listed(ioctl, ENUM_FRAMESIZES, 44, sizes):
-            kind, width, height = struct.unpack_from("III", size, 8)
-            if kind != DISCRETE:
-                continue
-
-            def intervals(k: int, data: bytearray, code: int = pixel_format, w: int = width, h: int = height) -> None:
-                struct.pack_into("IIII", data, 0, k, code, w, h)
-
-            for interval in _listed(ioctl, ENUM_FRAMEINTERVALS, 52, intervals):
-                kind, numerator, denominator = struct.unpack_from("III", interval, 16)
-                if kind == DISCRETE and numerator:
-                    modes.add((width, height, denominator / numerator))
-    return tuple(sorted(modes, key=_preference, reverse=True))
-
-
-def _listed(ioctl: Ioctl, request: int, size: int, ask: Callable[[int, bytearray], None]) -> list[bytearray]:
-    """Entries of one of V4L2's lists, up to its end."""
-    entries: list[bytearray] = []
-    while len(entries) < 256:
-        data = bytearray(size)
-        ask(len(entries), data)
-        try:
-            ioctl(request, data)
-        except OSError:
-            break
-        entries.append(data)
-    return entries
+    found = {(mode.width, mode.height, rate) for mode in modes(ioctl) for rate in mode.rates_hz}
+    return tuple(sorted(found, key=_preference, reverse=True))
 
 
 def _preference(mode: Mode) -> tuple[bool, int, float]:
@@ -862,7 +834,7 @@ class Reader:
     def _keep(self, picture: SourcePicture) -> None:
         options = self._options
         check_size(self._place, options, picture.image.shape[1], picture.image.shape[0])
-        image = one_channel(picture.image, options.channel, options.flip)
+        image = one_channel(self._watch.eight_bits(picture.image), options.channel, options.flip)
         with self._changed:
             if self._ending:  # closed meanwhile; another reader may use the watch
                 return

@@ -12,7 +12,7 @@ from urllib.parse import SplitResult
 import msgspec
 from msgspec import Meta
 
-from stereoservo.messages.addresses import Address, AddressError, without_secrets
+from stereoservo.messages.addresses import Address, AddressError, keep_secret, without_secrets
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.episodes import EpisodeNumber
 from stereoservo_drivers.options import decode_options
@@ -33,8 +33,8 @@ _NUMBER = re.compile(r"%(0\d+)?d")
 _NO_URL = SplitResult("", "", "", "", "")
 VALID_SOURCES = (
     "a device number (0) or path (/dev/video0), a file (.avi, .mkv, .mp4), numbered pictures (left-%04d.png), "
-    "http://, https:// (MJPEG), rtsp://, genicam:// (GigE Vision, USB3 Vision), or, with `episode`, the folder of a "
-    "LeRobot data set"
+    "http://, https:// (MJPEG, or a snapshot), rtsp://, genicam:// (GigE Vision, USB3 Vision), or, with `episode`, the "
+    "folder of a LeRobot data set"
 )
 
 
@@ -44,7 +44,8 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     ``source``: device number or path, video file, numbered pictures (one ``%04d`` in the file's name), or URL; files
     are relative to the cell file's directory.
     ``width``, ``height`` [px]: requested from a device, and compared with the first picture of any source.
-    ``rate_hz``: requested from a device; grid on which missing frames are counted; rate of files without stamps.
+    ``rate_hz``: requested from a device; grid on which missing frames are counted; rate of files without stamps, and of
+    requests to a camera of single pictures (snapshots).
     ``latency_s``: from the shutter to the reception, subtracted from the time of reception (recordings with stamps
     already include it).
     ``pixel_format``: four letters such as ``MJPG``, which many USB cameras need for their full rate.
@@ -100,6 +101,7 @@ class VideoOptions(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
     def __post_init__(self) -> None:
         if isinstance(self.source, str) and "://" in self.source:
+            keep_secret(self.source)
             msgspec.structs.force_setattr(self, "source", Address(self.source))
 
 

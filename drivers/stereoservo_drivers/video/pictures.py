@@ -15,12 +15,18 @@ _SIZE_MARKERS = frozenset({*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC})
 _BARE_MARKERS = frozenset({0x01, *range(0xD0, 0xD9)})
 
 
-PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-"""Decoder flag for picture files: gray ones unchanged, others in colour, which :func:`one_channel` rounds properly."""
+JPEG, PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+"""First bytes of every such picture."""
+PICTURE_FLAG = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+"""Decoder flag for picture files: gray ones unchanged, others in colour, which :func:`one_channel` rounds properly; of
+any depth, see :meth:`StreamMonitor.eight_bits`.
+"""
 
 
-def jpeg_flag(channel: Channel) -> int:
-    """Decoder flag for JPEG data: luma is coded separately, and faster to decode alone."""
+def picture_flag(data: bytes, channel: Channel) -> int:
+    """Decoder flag for ``data`` of a stream: the luma of JPEG is coded separately, and faster to decode alone."""
+    if data.startswith(PNG):
+        return PICTURE_FLAG
     expected = cv2.IMREAD_GRAYSCALE if channel == "gray" else cv2.IMREAD_COLOR
     return expected | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -56,12 +62,15 @@ def size_error(place: Place, options: VideoOptions, width: int, height: int) -> 
     )
 
 
-def jpeg_size(data: bytes | bytearray) -> tuple[int, int] | None:
-    """Width and height of complete JPEG data (begin marker, frame header, end marker after it), or None.
+def picture_size(data: bytes | bytearray) -> tuple[int, int] | None:
+    """Width and height of complete JPEG data (begin marker, frame header, end marker after it) or PNG data, or None.
 
     Decoders silently fill in missing data. Cameras may pad after the end; within coded data there is no end marker, and
     that of a thumbnail is before the frame header. ITU-T T.81, B.1.
     """
+    if data.startswith(PNG):
+        whole = data[12:16] == b"IHDR" and data.rfind(b"IEND") > 0
+        return (int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if whole else None
     if data[:2] != b"\xff\xd8":
         return None
     at = 2
@@ -83,10 +92,14 @@ def jpeg_size(data: bytes | bytearray) -> tuple[int, int] | None:
 # -- monitor of a stream ---------------------------------------------------------------------------------------
 
 
+DEPTHS = (8, 10, 12, 14, 16)
+
+
 class StreamMonitor:
     """Numbers the frames of one camera, counts missing ones, withholds repeated images. Persists over reconnections.
 
-    ``row``: number of consecutive pictures equal to the last one delivered.
+    ``row``: number of consecutive pictures equal to the last one delivered. ``bits``: depth of the pictures, the
+    smallest of 8, 10, 12, 14 and 16 that held them all.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -95,6 +108,7 @@ class StreamMonitor:
         self.frozen = 0
         self.row = 0
         self.number = -1
+        self.bits = 8
         self._rate_hz = rate_hz
         self._last: ImageArray | None = None
         self._last_seq: int | None = None
@@ -107,6 +121,15 @@ class StreamMonitor:
         self._last_seq = None
         self._last_ns = None
         self._late = 0
+
+    def eight_bits(self, image: ImageArray) -> ImageArray:
+        """``image`` in 8 bits: of deeper ones the upper 8 of :attr:`bits`, since cameras of 10 or 12 bits leave the
+        upper ones of 16 empty.
+        """
+        if image.dtype == np.uint8:
+            return image
+        self.bits = max(self.bits, next(bits for bits in DEPTHS if int(image.max()) >> bits == 0))
+        return (image >> (self.bits - 8)).astype(np.uint8)
 
     def see(self, image: ImageArray, t_received_ns: int, seq: int | None, skipped: int, *, look: bool) -> bool:
         """Count an image and set its :attr:`number`; False: it must be withheld.

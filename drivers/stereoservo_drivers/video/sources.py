@@ -255,9 +255,16 @@ POWER_LINE = {0: 0, 50: 1, 60: 2}
 """Values of the control ``power_line``, by hertz; 0: no filter."""
 DISABLED = 0x0001
 CAPTURE = 1
+"""``V4L2_BUF_TYPE_VIDEO_CAPTURE``, and ``V4L2_CAP_VIDEO_CAPTURE``."""
 DISCRETE = 1
 MOST_ENTRIES = 256
 """Largest number of entries read from a list, in case a driver never ends it."""
+
+
+class Capability(ctypes.Structure):
+    """``struct v4l2_capability``."""
+
+    _fields_ = [("names", c_uint8 * 84), ("capabilities", c_uint32), ("device_caps", c_uint32), ("rest", c_uint32 * 3)]
 
 
 class QueryControl(ctypes.Structure):
@@ -320,6 +327,7 @@ def _read_write(number: int, structure: type[ctypes.Structure]) -> int:
     return 3 << 30 | ctypes.sizeof(structure) << 16 | ord("V") << 8 | number
 
 
+QUERY_CAPABILITY = 2 << 30 | ctypes.sizeof(Capability) << 16 | ord("V") << 8
 ENUM_FORMAT = _read_write(2, FormatDescription)
 GET_CONTROL = _read_write(27, Control)
 SET_CONTROL = _read_write(28, Control)

@@ -41,6 +41,7 @@ from stereoservo.messages.decoding import RecordBoundary, cause_of
 from stereoservo.messages.directories import CellDirectories
 from stereoservo.messages.locks import AlreadyRunningError, ChannelLock, hardware_lock_path
 from stereoservo.messages.recording_request import request_path
+from stereoservo.messages.servo_state import STALE_PERIODS
 from stereoservo.numerics.arrays import ImageArray
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
@@ -234,6 +235,7 @@ def camera_loop(
     """
     pause_s = FIRST_PAUSE_S
     quiet = Quiet(period_s, poll_s)
+    silent_s = max(SILENT_CAMERA_S, STALE_PERIODS * period_s)
     down = False
     while True:
         try:
@@ -251,8 +253,8 @@ def camera_loop(
                     if pipeline.light is not None:
                         report(pipeline.light[0], f"camera {camera} {pipeline.light[1]}")
                     yield max(quiet.after_frame() - (heard_ns - polled_ns) * 1e-9, 0.0)
-                elif (now_ns() - heard_ns) * 1e-9 > SILENT_CAMERA_S:
-                    raise DriverError("silent", f"no image for {SILENT_CAMERA_S:g} s", retry=True)
+                elif (now_ns() - heard_ns) * 1e-9 > silent_s:
+                    raise DriverError("silent", f"no image for {silent_s:g} s", retry=True)
                 else:
                     quiet.unsuccessful_poll()
                     yield poll_s

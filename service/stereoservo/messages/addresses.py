@@ -7,7 +7,7 @@ from __future__ import annotations
 import hashlib
 import re
 import string
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple, Self
 from urllib.parse import SplitResult, quote, unquote, unquote_to_bytes
 
@@ -27,6 +27,7 @@ _SECRET_KEY = re.compile(
     r"pas|pwd|psw|secret|token|auth|sig|cred|key|login|user|usr|account|sess|hash|^(?:p|pw|pin|sid|jwt|code)$",
     re.IGNORECASE,
 )
+_USER_KEY = re.compile(r"user|usr|account|login$", re.IGNORECASE)
 _SECRET_OPTION = re.compile(r"passw|pwd|secret|token|credential|api_?key", re.IGNORECASE)
 _VALUE = re.compile(r"([^?&;/#=\s]*)=[^?&;/#]*?(?=_[A-Za-z]+=|[?&;/#]|$)")
 _BEHIND = (
@@ -139,11 +140,29 @@ def keep_secret(value: Any, key: str = "") -> None:
     elif isinstance(value, str):
         if _SECRET_OPTION.search(key) and len(value) >= SHORTEST:
             _kept[value] = HIDDEN
-        address, user = Address(value), _read(value).userinfo
+        address = Address(value)
         if address != value:
             _kept[value] = address
-        if user is not None and len(user) >= SHORTEST:
-            _kept[user] = HIDDEN
+        for secret in _secrets_in(value):
+            for form in (secret, unquote(secret), quote(unquote(secret)), quote(secret)):
+                if len(form) >= SHORTEST:
+                    _kept[form] = HIDDEN
+
+
+def _secrets_in(text: str) -> Iterator[str]:
+    """User and password of an address, the password alone, and its parameters from the first secret one on; of these
+    each value but a user's name.
+    """
+    _, userinfo, rest, _ = _read(text)
+    if userinfo is not None:
+        yield userinfo
+        yield userinfo.partition(":")[2]
+    shown = _without_parameters(rest)
+    if shown != rest:
+        yield rest[len(shown) - len(HIDDEN) :]
+        for match in _VALUE.finditer(rest):
+            if _SECRET_KEY.search(key := unquote(match[1])) and not _USER_KEY.search(key):
+                yield match[0].partition("=")[2]
 
 
 def redacted(text: str) -> str:

@@ -26,6 +26,7 @@ its values are then unknown.
 """
 STALE_PERIODS = 3.0
 NO_CAMERA = "no camera delivers frames: whether the model still holds is unknown"
+NO_FRAMES = "no camera delivers frames: the reasons CAMERA_SILENT state why; goals by joints need none"
 COMMISSIONING_SPEED = 0.05
 """Fraction of the cell's speed that `run --commissioning` allows."""
 
@@ -148,6 +149,11 @@ def state_message(
     cameras = {camera.name: _age_s(state.frames_ns.get(camera.name, 0), now_ns) for camera in run.cameras}
     fresh = {camera.name for camera in run.cameras if _fresh(cameras[camera.name], camera.rate_hz)}
     header: dict[str, Any] = {name: getattr(status, name) for name in StatusHeader.__struct_fields__}
+    if not fresh:
+        header["reasons"] = tuple(
+            msgspec.structs.replace(reason, hint=NO_FRAMES) if reason.code == "FEATURES_STALE" else reason
+            for reason in status.reasons
+        )
     return StateMessage(
         **header,
         cell=run.cell.cell.name,

@@ -371,3 +371,27 @@ def test_gray_of_a_colour_picture_is_its_luma(tmp_path, camera):
     frames, _ = play(camera("p%03d.png", pace="every"))
     luma = image @ np.array([0.114, 0.587, 0.299])  # ITU-R BT.601
     assert np.abs(frames[0].image - luma).max() <= 0.51
+
+
+@pytest.mark.parametrize(("bits", "ending"), [(10, "png"), (12, "png"), (16, "png"), (16, "tif"), (16, "pgm")])
+def test_the_upper_eight_bits_of_deep_pictures(tmp_path, camera, bits, ending):
+    """10 or 12 bits in 16: the depth is that of the brightest picture so far, so a dark one stays dark."""
+    seen = np.stack([picture(1), picture(2) // 16, picture(3)])
+    for k, image in enumerate(seen):
+        cv2.imwrite(str(tmp_path / f"p{k:03d}.{ending}"), image.astype(np.uint16) << (bits - 8))
+    frames, _ = play(camera(f"p%03d.{ending}", pace="every"))
+    assert np.array_equal([frame.image for frame in frames], seen)
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_a_portrait_in_gray_or_colour(tmp_path, camera, channels):
+    image = picture(1, HEIGHT, WIDTH)
+    cv2.imwrite(str(tmp_path / "p000.png"), cv2.merge([image] * channels))
+    frames, _ = play(camera("p%03d.png", pace="every", width=HEIGHT, height=WIDTH))
+    assert np.array_equal(frames[0].image, image)
+
+
+def test_pictures_of_no_whole_numbers_are_told(tmp_path, camera):
+    cv2.imwrite(str(tmp_path / "p000.tif"), picture(1).astype(np.float32))
+    with pytest.raises(DriverError, match="of another kind"):
+        camera("p%03d.tif").configure()

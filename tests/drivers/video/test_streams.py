@@ -246,14 +246,6 @@ def test_a_stream_without_an_end_and_without_pictures_is_told(camera, server):
     assert (error.code, error.retry) == ("not_mjpeg", True)
 
 
-def test_an_address_of_a_snapshot_is_told(camera, server):
-    server.content_type = "image/jpeg"
-    server.stream = lambda handler: handler.wfile.write(jpeg(picture(1)))
-    error = failure(start(camera(server.url)))
-    assert (error.code, error.retry) == ("connection_lost", True)
-    assert "snapshot" in str(error)
-
-
 def test_parts_that_are_no_jpeg_are_told(camera, server):
     def stream(handler):
         handler.wfile.write(b"--frame\r\nContent-Type: text/plain\r\nContent-Length: 2\r\n\r\nhi\r\n")
@@ -448,7 +440,7 @@ def test_two_cameras_do_not_touch_each_other(camera, server):
     try:
         first, second = start(camera(server.url)), start(camera(other.url))
         other.close()
-        assert failure(second).code == "connection_lost"
+        assert failure(second).code in ("connection_lost", "refused")
         assert len(poll_until(first, 5)) == 5
     finally:
         other.close()
