@@ -6,7 +6,7 @@ This is the simulation's ground truth. The service never sees it; it learns the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,6 +27,17 @@ class Capsule:
     radius: float
 
 
+class UrdfPosition(NamedTuple):
+    """Position of a URDF's joint ``name``: ``factor`` times that of the robot's joint of index ``joint``, plus
+    ``offset`` [rad or m].
+    """
+
+    name: str
+    joint: int
+    factor: float = 1.0
+    offset: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A serial arm of ``n`` joints, each about or along the z axis of its frame.
@@ -36,8 +47,8 @@ class Robot:
     ``links`` (n, 4, 4): from each joint's frame, moved, to the next one's at its zero, the last to the flange.
     ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the links in their joints' frames.
     ``shapes``: those of link 0 are in the world.
-    ``file``: the URDF that it was read from, mounted at ``mounted`` (4, 4) in the world, with the flange at its link
-    ``flange``; ``notes``: what is omitted of it.
+    ``text``: the URDF that it was read from, for physics and images, mounted at ``mounted`` (4, 4) in the world, with
+    the flange at its link ``flange`` and its joints at ``positions``; ``notes``: what is odd or omitted of it.
     """
 
     name: str
@@ -47,7 +58,8 @@ class Robot:
     masses: FloatArray
     centres: FloatArray
     shapes: tuple[Capsule, ...]
-    file: Path | None = None
+    text: str = ""
+    positions: tuple[UrdfPosition, ...] = ()
     mounted: FloatArray = field(default_factory=lambda: np.eye(4))
     flange: str = "flange"
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.world.arms.arm_cell import UrdfError, load_urdf, urdf_path
+from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf, urdf_path
 from stereoservo_sim.world.robots import Robot
 
 from ...corrupted import corrupted_copies
