@@ -1,6 +1,6 @@
 """Arms of URDF files as they are: each read, compared with pybullet, learnt in lockstep, and sent to one goal.
 
-`python tests/sim/world/urdf_survey.py OUT.jsonl FOLDER…` appends a line for each file that OUT.jsonl does not have yet,
+`python tests/sim/world/urdf_survey.py OUT.jsonl PLACE…` appends a line for each file that OUT.jsonl does not have yet,
 and prints the totals. `--copied` copies each file alone to an empty folder first, as people do. A file of several arms
 is tried with the first flange that the refusal names. Files without a chain of two joints are no arms, nor are those
 whose joints are spherical.
@@ -74,11 +74,10 @@ def reached(path: Path, flange: str) -> dict[str, object]:
         operator = LockstepOperator(lockstep, seed=0)
         lockstep.run_for(0.4)
         operator.enable()
-        model = operator.calibrate()
+        operator.calibrate()
         event, _ = taught_and_reached(operator, truth.base, "stereo", goal)
         return {
             "end": event.kind,
-            "rms_px": round(model.rms_px, 5),
             "error_px": round(end_error(truth, history, goal), 3),
         }
 
@@ -115,13 +114,15 @@ def usable(line: dict) -> bool:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("places", type=Path, nargs="+", help="files, or folders of such")
     parser.add_argument("--copied", action="store_true")
     asked = parser.parse_args()
     asked.out.touch()
     lines = [json.loads(text) for text in asked.out.read_text().splitlines()]
     done = {line["file"] for line in lines}
-    found = sorted({path.resolve() for folder in asked.folders for path in folder.rglob("*.urdf")})
+    found = sorted(
+        {path.resolve() for place in asked.places for path in ([place] if place.is_file() else place.rglob("*.urdf"))}
+    )
     for path in found:
         if str(path) in done:
             continue
@@ -133,9 +134,8 @@ def main() -> None:
         print(json.dumps(lines[-1]), flush=True)
     arms = [line for line in lines if line.get("joints", 0) >= 2]
     good = sum(map(usable, arms))
-    print(
-        f"{len(lines)} files, {len(arms)} arms: {good} usable, {sum(not line['flange'] for line in arms)} without an option"
-    )
+    alone = sum(not line["flange"] for line in arms)
+    print(f"{len(lines)} files, {len(arms)} arms: {good} usable; {alone} need no option")
 
 
 if __name__ == "__main__":

@@ -11,14 +11,15 @@ import os
 import re
 import stat
 from collections import Counter
-from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.resources import files
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TypeVar
 from urllib.parse import unquote
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -30,6 +31,8 @@ from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
 from stereoservo_sim.world.robots import Capsule, Robot, UrdfPosition
+
+T = TypeVar("T")
 
 MOVING: dict[str, JointKindName] = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic"}
 LARGEST = 1e6
@@ -158,12 +161,12 @@ def _decoded(data: bytes, notes: list[str]) -> str:
     except UnicodeDecodeError as error:
         declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([\w.-]+)", data)
         name = declared[1].decode() if declared else ""
-        try:
-            return data.decode(name if codecs.lookup(name).name != "utf-8" else "cp1252")
-        except (LookupError, UnicodeDecodeError):
-            line = data.count(b"\n", 0, error.start) + 1
-            notes.append(f"line {line} is not UTF-8: the file is read in code page 1252")
-            return data.decode("cp1252", "replace").rstrip("\0")
+        with suppress(LookupError, UnicodeError):
+            if codecs.lookup(name).name != "utf-8":
+                return data.decode(name)
+        line = data.count(b"\n", 0, error.start) + 1
+        notes.append(f"line {line} is not UTF-8: the file is read in code page 1252")
+        return data.decode("cp1252", "replace").rstrip("\0")
 
 
 def _name(element: Element) -> str:
@@ -700,7 +703,7 @@ def _rigid_parts(tree: UrdfTree, axes: list[_Axis], mounted: FloatArray) -> list
                 waiting.append((joint.child, entry[joint.name], part + 1))
             else:
                 rest = later.get(joint.name, resting_position(joint.element)) if joint.moves else 0.0
-                moved = motion(joint.kind, joint.axis, rest) if joint.moves else np.eye(4)
+                moved = motion(joint.kind, joint.axis, rest) if rest else np.eye(4)
                 waiting.append((joint.child, pose @ joint.origin @ moved, part))
     return parts
 
@@ -708,10 +711,7 @@ def _rigid_parts(tree: UrdfTree, axes: list[_Axis], mounted: FloatArray) -> list
 def resting_position(element: Element) -> float:
     """Rest position of a joint beside the arm [rad or m]: zero, or the nearest position in its range."""
     kind = MOVING.get(element.get("type", "").strip().lower(), "revolute")
-    try:
-        ends, _ = joint_range(element, kind)
-    except ValueError:  # limits that cannot be used do not concern the arm
-        return 0.0
+    ends, _ = _used(lambda: joint_range(element, kind)) or (None, "")
     return float(np.clip(0.0, *ends)) if ends is not None else 0.0
 
 
@@ -892,14 +892,43 @@ def _physics_text(tree: UrdfTree, base: str, meshes: Meshes) -> str:
             root.append(_with_meshes(element, meshes))
     for joint in tree.joints.values():
         if joint.parent in links:
-            element = deepcopy(joint.element)
-            element.set("type", joint.kind if joint.moves else "fixed")
-            root.append(element)
+            root.append(_physics_joint(joint))
     for element in root.iter():
         for key in ("xyz", "rpy", "size", "scale", "rgba"):
             if "," in element.get(key, ""):
                 element.set(key, element.get(key, "").replace(",", " "))
     return ElementTree.tostring(root, "unicode")
+
+
+def _physics_joint(joint: UrdfJoint) -> Element:
+    """A copy of a joint with a unit axis and the limits that are used, the lower above the upper where there are none;
+    fixed if it has no axis, which joints beside the arm may lack.
+    """
+    element = deepcopy(joint.element)
+    element.set("type", "fixed")
+    if joint.moves and (axis := _used(lambda: joint.axis)) is not None:
+        element.set("type", joint.kind)
+        _part(element, "axis").set("xyz", " ".join(map(repr, axis.tolist())))
+        ends, _ = _used(lambda: joint_range(joint.element, MOVING[joint.kind])) or (None, "")
+        limit = _part(element, "limit")
+        for key, value in zip(("lower", "upper"), ends or (1.0, -1.0), strict=True):
+            limit.set(key, repr(value))
+        for key in ("effort", "velocity"):
+            limit.set(key, limit.get(key, "1"))
+    return element
+
+
+def _used(read: Callable[[], T]) -> T | None:
+    """What is read of a joint; None if it cannot be used, which is refused of the arm's own joints before."""
+    try:
+        return read()
+    except ValueError:
+        return None
+
+
+def _part(element: Element, tag: str) -> Element:
+    found = element.find(tag)
+    return ElementTree.SubElement(element, tag) if found is None else found
 
 
 def _with_meshes(link: Element, meshes: Meshes) -> Element:
