@@ -55,7 +55,8 @@ ABOVE = 3
 """Number of folders above a URDF's own in which its package's root is looked for."""
 ON_AXIS = 1e-6
 """Largest distance of coupled joints' axes from one line [m], and of their directions [rad]."""
-MOST_NAMES = 8
+MOST_NAMES, MOST_TEXT = 8, 2000
+"""Names listed in a message, and its length in characters: names in damaged files may have any length."""
 
 JAW = re.compile(r"gripper|jaw|finger|claw|pinch|grasp|thumb|knuckle", re.IGNORECASE)
 """Pattern of names of a gripper's joint at the end of a chain, unless the name matches `TURNS`."""
@@ -96,7 +97,7 @@ def load_urdf(path: Path, *, flange: str = "", mounted: FloatArray | None = None
     gripper. Joints that are coupled along one line are one joint of the robot. The robot's ``notes`` list what is
     omitted, and how it is included. Raises UrdfError.
     """
-    with decoding(lambda cause: UrdfError(f"{path}: {cause}")):
+    with decoding(lambda cause: UrdfError(f"{path}: {cause[:MOST_TEXT]}")):
         pose = np.eye(4) if mounted is None else mounted
         notes: list[str] = []
         tree = UrdfTree(_parsed(path, notes), path)
