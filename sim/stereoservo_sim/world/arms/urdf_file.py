@@ -898,6 +898,7 @@ def _physics_text(tree: UrdfTree, base: str, meshes: Meshes) -> str:
         for key in ("xyz", "rpy", "size", "scale", "rgba"):
             if "," in element.get(key, ""):
                 element.set(key, element.get(key, "").replace(",", " "))
+    ElementTree.indent(root)  # pybullet cuts long lines
     return ElementTree.tostring(root, "unicode")
 
 
