@@ -334,11 +334,13 @@ def test_meshes_are_taken_from_the_files_own_tree_alone(tmp_path: Path, named: s
     assert [Path(named).name in note for note in robot.notes] == ([] if found else [True])
 
 
-def test_endless_joints_are_read_and_may_be_long(tmp_path: Path) -> None:
-    robot = robot_of(tmp_path, [Row("turn", "base", "continuous"), *serial("j1", root="turn_link")])
-    assert robot.joints[0].position_max == pytest.approx(2 * np.pi)
-    long = robot_of(tmp_path, serial(*(f"j{k}" for k in range(3000))))
-    assert len(long.joints) == 3000
+def test_an_arm_of_too_many_joints_is_refused_with_a_flange_that_works(tmp_path: Path) -> None:
+    rows = serial(*(f"j{k}" for k in range(1500)))
+    with pytest.raises(UrdfError, match=r"1500 joints .* at most 12\. Valid: flange = '(\w+)'") as caught:
+        robot_of(tmp_path, rows)
+    flange = re.search(r"Valid: flange = '(\w+)'", str(caught.value))
+    assert flange is not None
+    assert len(robot_of(tmp_path, rows, flange[1]).joints) == 12
 
 
 CELL = """schema = 1

@@ -27,6 +27,7 @@ from xml.parsers import expat
 
 import numpy as np
 
+from stereoservo.messages.cell_file import MAX_JOINTS
 from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
@@ -48,8 +49,8 @@ MANY_TURNS, LARGEST_DEGREES = 4.0 * np.pi, 720.0
 """A revolute joint's limits beyond the first are degrees if they are whole numbers up to the second, else none."""
 SHORTEST = 1e-3
 """Least length between the end points of a capsule [m]; a sphere is a capsule of this length."""
-MOST_BYTES, MOST_MESH_BYTES = 8 << 20, 24 << 20
-"""Size of the largest URDF that is read, and of the largest mesh."""
+MOST_BYTES, MOST_JOINTS, MOST_MESH_BYTES = 8 << 20, 2000, 24 << 20
+"""Size of the largest URDF that is read, the number of its joints, and the size of the largest mesh."""
 MESHES = (".obj", ".stl", ".dae")
 ABOVE = 3
 """Number of folders above a URDF's own in which its package's root is looked for."""
@@ -288,7 +289,10 @@ class UrdfTree:
     def __init__(self, root: Element, path: Path) -> None:
         self.name, self.root = root.get("name") or path.stem, root
         self.links = self._unique("link")
-        self.joints = {name: self._joint(name, element) for name, element in self._unique("joint").items()}
+        joints = self._unique("joint")
+        if len(joints) > MOST_JOINTS:
+            raise ValueError(f"has {len(joints)} joints; files of up to {MOST_JOINTS} are read")
+        self.joints = {name: self._joint(name, element) for name, element in joints.items()}
         self.above: dict[str, UrdfJoint] = {}
         self._below: dict[str, list[UrdfJoint]] = {}
         for joint in self.joints.values():
@@ -582,6 +586,12 @@ def _coupled_axes(tree: UrdfTree, chain: list[UrdfJoint]) -> list[_Axis]:
     if apart is not None:
         coupled = next(joint for joint in chain if joint.mimics and tree.leader(joint)[0] == apart)
         raise _unlike(coupled, "with joints of the arm between them")
+    if len(groups) > MAX_JOINTS:
+        valid = groups[MAX_JOINTS - 1][1][-1][0].child
+        raise ValueError(
+            f"{len(groups)} joints are on the way to the flange {chain[-1].child!r}; a cell has at most {MAX_JOINTS}. "
+            f"Valid: flange = {valid!r} or another link before it"
+        )
     axes = [_axis(name, members) for name, members in groups]
     axes[-1].after[:] = axes[-1].after @ fixed
     return axes
