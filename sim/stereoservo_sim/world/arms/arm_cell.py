@@ -28,8 +28,10 @@ from stereoservo_sim.world.workpiece import Moved
 
 Length = Annotated[float, Meta(gt=0, le=20)]
 
-CANDIDATES, EXAMINED = 600, 8
-"""Number of base configurations drawn, and number of the best that are checked for visibility in the cameras."""
+CANDIDATES, EXAMINED, MOST_EXAMINED = 600, 8, 200
+"""Number of base configurations drawn, number of the best that are checked for visibility in the cameras, and largest
+number if all of those fail.
+"""
 WIDEST = 2.4
 """A joint's base is drawn within this distance from the centre of its range [rad]: some joints turn several times."""
 CLEAR = {"revolute": 0.5, "prismatic": 0.1}
@@ -163,14 +165,16 @@ def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
     drawn = np.where(np.isnan(stated), drawn, stated)
     scores = np.array([_suitability(robot, q) for q in drawn])
     best, found = -np.inf, None
-    for index in np.argsort(-scores, kind="stable")[:EXAMINED]:
+    for rank, index in enumerate(np.argsort(-scores, kind="stable")[:MOST_EXAMINED]):
+        if rank >= EXAMINED and found is not None:
+            break
         cell = laid_out(robot, place, mount, drawn[index])
         score = scores[index] + _room_before_cameras(cell)
         if score > best:
             best, found = score, drawn[index]
     if found is None:
         raise ValueError(
-            f"{robot.name}: of {EXAMINED} configurations in none do both cameras see every marker while each joint "
+            f"{robot.name}: of {MOST_EXAMINED} configurations in none do both cameras see every marker while each joint "
             "moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden by the "
             "flange's own link)"
         )
