@@ -1,7 +1,8 @@
 """Arms of URDF files as they are: each read, compared with pybullet, learnt in lockstep, and sent to one goal.
 
 `python tests/sim/world/urdf_survey.py OUT.jsonl PLACE…` appends a line for each file that OUT.jsonl does not have yet,
-and prints the totals. `--copied` copies each file alone to an empty folder first, as people do. A file of several arms
+and prints the totals. `--copied` copies each file alone to an empty folder first, as people do; `--read`
+reads and compares only. A file of several arms
 is tried with the first flange that the refusal names. Files without a chain of two joints are no arms, nor are those
 whose joints are spherical.
 """
@@ -82,7 +83,7 @@ def reached(path: Path, flange: str) -> dict[str, object]:
         }
 
 
-def surveyed(path: Path) -> dict[str, object]:
+def surveyed(path: Path, learns: bool) -> dict[str, object]:
     """Line of the survey for a file."""
     begin = time.process_time()
     line: dict[str, object] = {"file": str(path), "flange": ""}
@@ -99,7 +100,7 @@ def surveyed(path: Path) -> dict[str, object]:
         line |= {"joints": len(robot.joints), "notes": len(robot.notes)}
         line["read_s"] = round(time.process_time() - begin, 2)
         line["difference"] = engine_difference(robot)
-        line |= reached(path, str(line["flange"]))
+        line |= reached(path, str(line["flange"])) if learns else {}
     except Exception as error:  # the survey lists what happened and goes on
         line["failed"] = f"{type(error).__name__}: {error}"[:300]
     line["cpu_s"] = round(time.process_time() - begin, 1)
@@ -107,8 +108,9 @@ def surveyed(path: Path) -> dict[str, object]:
 
 
 def usable(line: dict) -> bool:
-    """Whether an arm was learnt and reached its goal, its kinematics as pybullet's."""
-    return line.get("end") == "goal_reached" and line["difference"] < CLOSE_M and line["error_px"] < 1.0
+    """Whether an arm's kinematics are pybullet's, and it was learnt and reached its goal if that was tried."""
+    learnt = line.get("end", "goal_reached") == "goal_reached" and line.get("error_px", 0.0) < 1.0
+    return learnt and "failed" not in line and line["difference"] < CLOSE_M
 
 
 def main() -> None:
@@ -116,6 +118,7 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("places", type=Path, nargs="+", help="files, or folders of such")
     parser.add_argument("--copied", action="store_true")
+    parser.add_argument("--read", action="store_true")
     asked = parser.parse_args()
     asked.out.touch()
     lines = [json.loads(text) for text in asked.out.read_text().splitlines()]
@@ -128,7 +131,7 @@ def main() -> None:
             continue
         with tempfile.TemporaryDirectory() as scratch:
             tried = Path(shutil.copy(path, scratch)) if asked.copied else path
-            lines.append({**surveyed(tried), "file": str(path)})
+            lines.append({**surveyed(tried, not asked.read), "file": str(path)})
         with asked.out.open("a") as out:
             out.write(json.dumps(lines[-1]) + "\n")
         print(json.dumps(lines[-1]), flush=True)

@@ -65,7 +65,7 @@ TURNS = re.compile(r"roll|pitch|yaw|rot|wrist|turn|swivel|spin", re.IGNORECASE)
 JAW_LINK = re.compile(r"jaw|finger|claw|thumb|moving", re.IGNORECASE)
 TOOL_FRAME = re.compile(r"tool0|tcp|gripper_frame|grasp|end_?effector|(?:^|_)eef?(?:_|$)", re.IGNORECASE)
 """Pattern of names of links fixed before the last joint at which the arm ends."""
-HAND, ASIDE, ARM = 4, 2, 4
+HAND, ASIDE, ARM = 7, 2, 4
 """Most joints of a finger; of a wheel, a head or a caster beside an arm; and least joints of an arm beside them."""
 
 
@@ -449,7 +449,7 @@ def _valid(arms: list[_Arm]) -> str:
 def _arms(tree: UrdfTree) -> list[_Arm]:
     """The arms of a file, those of most joints first."""
     found = [arm for root in tree.roots for arm in _onward(tree, root, _Arm()) if any(one.moves for one in arm.chain)]
-    return sorted(found, key=lambda arm: -len(arm.driven))
+    return sorted({arm.chain[-1].child: arm for arm in found}.values(), key=lambda arm: -len(arm.driven))
 
 
 def _onward(tree: UrdfTree, link: str, arm: _Arm) -> list[_Arm]:
