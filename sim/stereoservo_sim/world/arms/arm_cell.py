@@ -174,9 +174,9 @@ def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
             best, found = score, drawn[index]
     if found is None:
         raise ValueError(
-            f"{robot.name}: of {MOST_EXAMINED} configurations in none do both cameras see every marker while each joint "
-            "moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden by the "
-            "flange's own link)"
+            f"{robot.name}: of {MOST_EXAMINED} configurations in none do both cameras see every marker while each "
+            "joint moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden by "
+            "the flange's own link)"
         )
     return np.asarray(found)
 
