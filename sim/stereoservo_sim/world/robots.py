@@ -13,6 +13,8 @@ import numpy as np
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import JointSpec
 
+SHORTEST = 1e-3
+"""Least length between the end points of a capsule [m]; a sphere is a capsule of this length."""
 NO_EXTENT = 0.02
 """Radius [m] assumed for the inertia of a link without shapes."""
 
@@ -157,6 +159,40 @@ def urdf(robot: Robot) -> str:
 
 def _numbers(values: FloatArray) -> str:
     return " ".join(f"{float(value):.17g}" for value in values)
+
+
+def rotation_to_axis(axis: FloatArray) -> FloatArray:
+    """Rotation (4, 4) whose z is along ``axis``."""
+    z = axis / np.linalg.norm(axis)
+    turn = np.eye(4)
+    if z[2] > 1.0 - 1e-12:
+        return turn
+    x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
+    x /= np.linalg.norm(x)
+    turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return turn
+
+
+def capsule_around(link: int, points: FloatArray) -> Capsule:
+    """The slimmest capsule around points (k, 3), among those along the coordinate axes and the longest extent."""
+    middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
+    spread = points - middle
+    longest = np.linalg.eigh(spread.T @ spread)[1][:, -1]
+    best: tuple[float, Capsule] | None = None
+    for axis in (*np.eye(3), longest):
+        along = spread @ axis
+        across = spread - along[:, None] * axis
+        centre = 0.5 * (across.max(axis=0) + across.min(axis=0))
+        radius = float(np.linalg.norm(across - centre, axis=1).max())
+        low, high = float(along.min()) + radius, float(along.max()) - radius
+        if high - low < SHORTEST:
+            low, high = 0.5 * (low + high - SHORTEST), 0.5 * (low + high + SHORTEST)
+        start, end = (middle + centre + at * axis for at in (low, high))
+        volume = radius**2 * (high - low + 4.0 / 3.0 * radius)
+        if best is None or volume < best[0]:
+            best = volume, Capsule(link, tuple(start.tolist()), tuple(end.tolist()), max(radius, SHORTEST))
+    assert best is not None
+    return best[1]
 
 
 def roll_pitch_yaw(pose: FloatArray) -> FloatArray:

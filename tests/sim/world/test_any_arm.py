@@ -22,9 +22,10 @@ from stereoservo_sim.world.arms.arm_cell import (
     body_jacobian,
     cell_of,
     seen_by_all,
+    urdf_path,
 )
 from stereoservo_sim.world.arms.arm_goals import goals_of, goes_straight, straight_way
-from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf, urdf_path
+from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.mechanics import PINION, PRESETS, chosen_mechanics, gravity_load, largest_torques
 from stereoservo_sim.world.physics import PybulletPlant
 from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
+from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,7 +20,7 @@ from msgspec import Meta
 
 from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.world.arms.urdf_file import load_urdf, urdf_path
+from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.body import roof_body
 from stereoservo_sim.world.camera_rig import inverse_pose, look_at, stereo_rig
 from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames, shape_segments
@@ -67,6 +69,24 @@ class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=
     distance_m: Length | None = None
     baseline_m: Length = 0.20
     focal_px: Annotated[float, Meta(ge=100, le=5000)] | None = None
+
+
+def urdf_path(named: str, folder: Path) -> Path:
+    """Path of the URDF ``named`` in a cell file: relative to its ``folder``, else a file shipped here, else one of
+    pybullet_data. Raises UrdfError.
+    """
+    places = [folder, Path(str(files("stereoservo_sim.world.arms")))]
+    data = find_spec("pybullet_data")
+    if data is not None and data.submodule_search_locations:
+        places.append(Path(next(iter(data.submodule_search_locations))))
+    for place in places:
+        if (place / named).is_file():
+            return (place / named).absolute()
+    shipped = ", ".join(sorted(file.name for file in places[1].glob("*.urdf")))
+    raise UrdfError(
+        f"urdf = {named!r}: no such file in {', '.join(str(place) for place in places)}; shipped are {shipped}, and "
+        "pybullet_data has franka_panda/panda.urdf, kuka_iiwa/model.urdf, xarm/xarm6_robot.urdf"
+    )
 
 
 def place_of(options: Mapping[str, Any]) -> ArmPlace:
@@ -175,8 +195,8 @@ def base_for(robot: Robot, place: ArmPlace, mount: Mount) -> FloatArray:
     if found is None:
         raise ValueError(
             f"{robot.name}: of {MOST_EXAMINED} configurations in none do both cameras see every marker while each "
-            "joint moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden by "
-            "the flange's own link)"
+            "joint moves alone; state base = { joint = position, … }, or carried, distance_m (the body may be hidden "
+            "by the flange's own link)"
         )
     return np.asarray(found)
 

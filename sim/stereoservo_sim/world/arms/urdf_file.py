@@ -16,8 +16,6 @@ from contextlib import AbstractContextManager, suppress
 from copy import deepcopy
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib.resources import files
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TypeVar
 from urllib.parse import unquote
@@ -31,7 +29,7 @@ from stereoservo.messages.cell_file import MAX_JOINTS
 from stereoservo.messages.decoding import decoding
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
-from stereoservo_sim.world.robots import Capsule, Robot, UrdfPosition
+from stereoservo_sim.world.robots import Capsule, Robot, UrdfPosition, capsule_around, rotation_to_axis
 
 T = TypeVar("T")
 
@@ -47,8 +45,6 @@ ENDLESS: dict[JointKindName, float] = {"revolute": float(2.0 * np.pi), "prismati
 """Range to either side of a joint without limits [rad or m]."""
 MANY_TURNS, LARGEST_DEGREES = 4.0 * np.pi, 720.0
 """A revolute joint's limits beyond the first are degrees if they are whole numbers up to the second, else none."""
-SHORTEST = 1e-3
-"""Least length between the end points of a capsule [m]; a sphere is a capsule of this length."""
 MOST_BYTES, MOST_JOINTS, MOST_MESH_BYTES = 8 << 20, 2000, 24 << 20
 """Size of the largest URDF that is read, the number of its joints, and the size of the largest mesh."""
 MESHES = (".obj", ".stl", ".dae")
@@ -73,24 +69,6 @@ class UrdfError(ValueError):
     """A URDF file cannot be used; the text names the file, the cause and what would be valid."""
 
 
-def urdf_path(named: str, folder: Path) -> Path:
-    """Path of the URDF ``named`` in a cell file: relative to its ``folder``, else a file shipped here, else one of
-    pybullet_data. Raises UrdfError.
-    """
-    places = [folder, Path(str(files("stereoservo_sim.world.arms")))]
-    data = find_spec("pybullet_data")
-    if data is not None and data.submodule_search_locations:
-        places.append(Path(next(iter(data.submodule_search_locations))))
-    for place in places:
-        if (place / named).is_file():
-            return (place / named).absolute()
-    shipped = ", ".join(sorted(file.name for file in places[1].glob("*.urdf")))
-    raise UrdfError(
-        f"urdf = {named!r}: no such file in {', '.join(str(place) for place in places)}; shipped are {shipped}, and "
-        "pybullet_data has franka_panda/panda.urdf, kuka_iiwa/model.urdf, xarm/xarm6_robot.urdf"
-    )
-
-
 def load_urdf(path: Path, *, flange: str = "", mounted: FloatArray | None = None) -> Robot:
     """The arm of a URDF file, its root link at ``mounted`` (4, 4) in the world.
 
@@ -107,7 +85,7 @@ def load_urdf(path: Path, *, flange: str = "", mounted: FloatArray | None = None
         fixed, links, specs, positions = pose, [], [], []
         for k, axis in enumerate(axes):
             fixed = fixed @ axis.before
-            turn = _to_axis(axis.direction)
+            turn = rotation_to_axis(axis.direction)
             links.append(fixed @ turn)
             fixed = turn.T @ axis.after
             specs.append(_spec(axis, notes))
@@ -217,18 +195,6 @@ def _origin(element: Element) -> FloatArray:
     ]
     pose[:3, 3] = _vector(origin, "xyz")
     return pose
-
-
-def _to_axis(axis: FloatArray) -> FloatArray:
-    """Rotation (4, 4) whose z is along ``axis``."""
-    z = axis / np.linalg.norm(axis)
-    turn = np.eye(4)
-    if z[2] > 1.0 - 1e-12:
-        return turn
-    x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
-    x /= np.linalg.norm(x)
-    turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
-    return turn
 
 
 # -- the tree -------------------------------------------------------------------------------------------------
@@ -615,9 +581,13 @@ def _axis(name: str, group: list[tuple[UrdfJoint, float, float, FloatArray]]) ->
         raise _unlike(coupled, "against it, so that nothing moves")
     names = [joint.name for joint, *_ in group]
     return _Axis(
-        name if name in names else first.name, kinds.pop(), group[0][3], velocity / rate, pose,
+        name if name in names else first.name,
+        kinds.pop(),
+        group[0][3],
+        velocity / rate,
+        pose,
         [(joint, factor / rate, offset) for joint, factor, offset, _ in group],
-    )  # fmt: skip
+    )
 
 
 def _unlike(joint: UrdfJoint, how: str) -> ValueError:
@@ -634,7 +604,7 @@ def motion(kind: str, axis: FloatArray, value: float) -> FloatArray:
     if kind == "prismatic":
         moved[:3, 3] = value * axis
         return moved
-    turn = _to_axis(axis)
+    turn = rotation_to_axis(axis)
     c, s = np.cos(value), np.sin(value)
     return turn @ np.array([[c, -s, 0, 0], [s, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]) @ turn.T
 
@@ -697,7 +667,7 @@ def _rigid_parts(tree: UrdfTree, axes: list[_Axis], mounted: FloatArray) -> list
     entry = {}
     for axis in axes:
         joint, _, offset = axis.members[0]
-        entry[joint.name] = _to_axis(axis.direction).T @ motion(joint.kind, joint.axis, offset)
+        entry[joint.name] = rotation_to_axis(axis.direction).T @ motion(joint.kind, joint.axis, offset)
     later = {joint.name: offset for axis in axes for joint, _, offset in axis.members[1:]}
     parts: list[Part] = [[]]
     root = axes[0].members[0][0].parent
@@ -749,7 +719,7 @@ def _shapes(parts: list[Part], meshes: Meshes) -> Iterator[Capsule]:
                     corners = _corners(element.find("geometry"), meshes)
                     if len(corners):
                         placed = pose @ _origin(element)
-                        yield _capsule(number, corners @ placed[:3, :3].T + placed[:3, 3])
+                        yield capsule_around(number, corners @ placed[:3, :3].T + placed[:3, 3])
 
 
 def _corners(geometry: Element | None, meshes: Meshes) -> FloatArray:
@@ -769,28 +739,6 @@ def _corners(geometry: Element | None, meshes: Meshes) -> FloatArray:
     ring = radius * np.stack([np.cos(angles), np.sin(angles), np.zeros(16)], axis=1)
     half = np.array([0.0, 0.0, 0.5 * length])
     return np.concatenate([ring + half, ring - half])
-
-
-def _capsule(link: int, points: FloatArray) -> Capsule:
-    """The slimmest capsule around points (k, 3), among those along the coordinate axes and the longest extent."""
-    middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
-    spread = points - middle
-    longest = np.linalg.eigh(spread.T @ spread)[1][:, -1]
-    best: tuple[float, Capsule] | None = None
-    for axis in (*np.eye(3), longest):
-        along = spread @ axis
-        across = spread - along[:, None] * axis
-        centre = 0.5 * (across.max(axis=0) + across.min(axis=0))
-        radius = float(np.linalg.norm(across - centre, axis=1).max())
-        low, high = float(along.min()) + radius, float(along.max()) - radius
-        if high - low < SHORTEST:
-            low, high = 0.5 * (low + high - SHORTEST), 0.5 * (low + high + SHORTEST)
-        start, end = (middle + centre + at * axis for at in (low, high))
-        volume = radius**2 * (high - low + 4.0 / 3.0 * radius)
-        if best is None or volume < best[0]:
-            best = volume, Capsule(link, tuple(start.tolist()), tuple(end.tolist()), max(radius, SHORTEST))
-    assert best is not None
-    return best[1]
 
 
 # -- meshes ---------------------------------------------------------------------------------------------------
