@@ -25,11 +25,11 @@ from stereoservo_sim.world.arms.arm_cell import (
     urdf_path,
 )
 from stereoservo_sim.world.arms.arm_goals import goals_of, goes_straight, straight_way
-from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.mechanics import PINION, PRESETS, chosen_mechanics, gravity_load, largest_torques
 from stereoservo_sim.world.physics import PybulletPlant
 from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames
 from stereoservo_sim.world.simulated_cell import SimulatedCell
+from stereoservo_sim.world.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.workpiece import Moved
 
 HERE = Path(__file__).parent

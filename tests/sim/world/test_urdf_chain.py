@@ -14,9 +14,9 @@ import pytest
 
 from stereoservo.cli import main as cli
 from stereoservo_sim.world.arms.arm_cell import urdf_path
-from stereoservo_sim.world.arms.urdf_file import MOST_MESH_BYTES, UrdfError, load_urdf
 from stereoservo_sim.world.physics import PybulletPlant
 from stereoservo_sim.world.robots import Robot, flange_pose
+from stereoservo_sim.world.urdf_file import MOST_MESH_BYTES, UrdfError, load_urdf
 
 from ...corrupted import corrupted_copies
 

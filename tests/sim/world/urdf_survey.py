@@ -25,10 +25,10 @@ from stereoservo_sim.demonstration.lockstep_operator import LockstepOperator
 from stereoservo_sim.demonstration.truth import true_cell
 from stereoservo_sim.experiments.lockstep_cells import end_error, taught_and_reached
 from stereoservo_sim.world.arms.arm_goals import goals_of
-from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.history import TrueJointHistory
 from stereoservo_sim.world.physics import PybulletPlant
 from stereoservo_sim.world.robots import Robot, flange_pose
+from stereoservo_sim.world.urdf_file import UrdfError, load_urdf
 
 CLOSE_M = 1e-6
 

@@ -7,6 +7,7 @@ demonstration's goals. The search is seeded and depends on the options alone, so
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from importlib.resources import files
@@ -20,12 +21,12 @@ from msgspec import Meta
 
 from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo_sim.world.arms.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.body import roof_body
 from stereoservo_sim.world.camera_rig import inverse_pose, look_at, stereo_rig
 from stereoservo_sim.world.robots import Robot, flange_pose, joint_frames, shape_segments
 from stereoservo_sim.world.simulated_cell import SimulatedCell, simulated_cell
 from stereoservo_sim.world.synthetic import rotation, translation
+from stereoservo_sim.world.urdf_file import UrdfError, load_urdf
 from stereoservo_sim.world.workpiece import Moved
 
 Length = Annotated[float, Meta(gt=0, le=20)]
@@ -44,8 +45,8 @@ HEIGHT = 0.25
 """Required height of body and cameras above the floor, on which the arm stands [m]."""
 TRIALS = {"revolute": (0.1, 0.2, 0.3, 0.45), "prismatic": (0.04, 0.08, 0.12, 0.16)}
 """Tested displacements of each joint to either side of the base [rad or m]."""
-BEHIND_BODY = 0.05
-"""Distance from the parts already on the flange to the ridge of the body [m]."""
+BEHIND_BODY, FARTHER = 0.05, 0.15
+"""Distance from the parts already on the flange to the ridge of the body [m], and what is added if these hide it."""
 
 
 class ArmPlace(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -115,6 +116,10 @@ def cell_of(place: ArmPlace, mount: Mount, folder: Path) -> SimulatedCell:
 def _searched_cell(encoded: bytes, mount: Mount, path: Path) -> SimulatedCell:
     place = msgspec.json.decode(encoded, type=ArmPlace)
     robot = load_urdf(path, flange=place.flange, mounted=place.mounted.matrix)
+    if place.carried == Moved():
+        with suppress(ValueError):  # the arm's hand may hide the body: then it is farther out
+            return laid_out(robot, place, mount, base_for(robot, place, mount))
+        place = msgspec.structs.replace(place, carried=Moved((0.0, 0.0, FARTHER)))
     return laid_out(robot, place, mount, base_for(robot, place, mount))
 
 

@@ -1,7 +1,6 @@
 """Arms as URDF files describe them: which joints are the arm, where they are, how they are coupled, and their shapes.
 
-What is odd is listed in the robot's ``notes`` and read as far as it is clear; what the arm itself needs and lacks is
-refused with the cause and what would be valid.
+What is odd is listed in the robot's ``notes``; what the arm itself needs and lacks is refused.
 """
 
 from __future__ import annotations
@@ -342,7 +341,7 @@ class UrdfTree:
 
 @dataclass
 class _Arm:
-    """A chain of joints, notes on what it omits, and the names of the joints that these notes cover."""
+    """A chain of joints, notes on what it omits, and the joints that these notes cover."""
 
     chain: list[UrdfJoint] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
@@ -351,9 +350,6 @@ class _Arm:
     def omit(self, note: str, joints: list[UrdfJoint]) -> None:
         self.notes.append(note)
         self.covered.update(joint.name for joint in joints)
-
-    def with_joint(self, joint: UrdfJoint) -> _Arm:
-        return _Arm([*self.chain, joint], [*self.notes], {*self.covered})
 
     @property
     def driven(self) -> set[str]:
@@ -433,7 +429,8 @@ def _onward(tree: UrdfTree, link: str, arm: _Arm) -> list[_Arm]:
                 _without_gripper(arm, link, [one for _, ones in beyond for one in ones])
                 break
             if len(beyond) > 1 and len(driven) > 1:
-                return [end for joint in driven for end in _onward(tree, joint.child, arm.with_joint(joint))]
+                copies = [_Arm([*arm.chain, joint], [*arm.notes], {*arm.covered}) for joint in driven]
+                return [end for copy in copies for end in _onward(tree, copy.chain[-1].child, copy)]
             moving = [joint for joint, _ in beyond] if len(beyond) == 1 else driven
         arm.chain.append(moving[0])
         link = moving[0].child
@@ -503,8 +500,7 @@ def _note_beside(tree: UrdfTree, arm: _Arm) -> None:
 
 
 def _names(joints: list[UrdfJoint]) -> str:
-    names = [repr(joint.name) for joint in joints[:MOST_NAMES]]
-    return ", ".join(names) + (f" and {len(joints) - MOST_NAMES} more" if len(joints) > MOST_NAMES else "")
+    return _listed([repr(joint.name) for joint in joints])[2:]
 
 
 def _listed(names: list[str] | dict[str, Element]) -> str:
