@@ -17,7 +17,7 @@ import numpy as np
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.plugins import missing_extra
 from stereoservo_sim.world.mechanics import GRAVITY
-from stereoservo_sim.world.robots import Robot, roll_pitch_yaw, urdf
+from stereoservo_sim.world.robots import Robot, UrdfPosition, roll_pitch_yaw, urdf
 from stereoservo_sim.world.velocity_drives import RigidPlant
 
 MAX_TORQUE = 1000.0
@@ -60,13 +60,16 @@ def import_pybullet() -> Any:
 
 @dataclass(frozen=True)
 class LoadedRobot:
-    """An arm in a simulation: the id of its body, the indices of its joints, and of the link of the flange.
+    """An arm in a simulation: the id of its body, the indices of its k joints, and of the link of the flange.
 
-    ``beside``: joints outside the arm, with their rest positions; ``moving``: all joints that move.
+    The engine's positions (k,) are ``coupling`` (k, n) times the robot's plus ``offsets`` (k,): coupled joints are one
+    of the robot's. ``beside``: joints outside the arm, with their rest positions; ``moving``: all joints that move.
     """
 
     body: int
     joints: list[int]
+    coupling: FloatArray
+    offsets: FloatArray
     flange: int
     beside: dict[int, float]
     moving: list[int]
@@ -75,9 +78,8 @@ class LoadedRobot:
 def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
     """Load an arm into a simulation, the joints beside it at rest. Raises PhysicsError if the engine cannot."""
     with tempfile.TemporaryDirectory() as folder, _quiet():
-        path = robot.file or Path(folder) / f"{robot.name}.urdf"
-        if robot.file is None:
-            path.write_text(urdf(robot))
+        path = Path(folder) / "arm.urdf"
+        path.write_text(robot.text or urdf(robot), "utf-8")
         try:
             body = int(
                 bullet.loadURDF(
@@ -90,7 +92,7 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
             )
         except bullet.error as error:
             raise PhysicsError(
-                f"pybullet cannot load {path}: {error} (are its meshes where it says? driver 'fake' and "
+                f"pybullet cannot load {robot.name}: {error} (a mesh that it cannot read? driver 'fake' and "
                 "background = 'arm' need none)"
             ) from error
     infos = [
@@ -100,14 +102,19 @@ def load_robot(bullet: Any, client: int, robot: Robot) -> LoadedRobot:
     index = {info[1].decode(): k for k, info in enumerate(infos)}
     links = {info[12].decode(): k for k, info in enumerate(infos)}
     moving = [k for k, info in enumerate(infos) if info[2] != bullet.JOINT_FIXED]
-    joints = [index[joint.name] for joint in robot.joints]
+    positions = robot.positions or tuple(UrdfPosition(joint.name, k) for k, joint in enumerate(robot.joints))
+    joints = [index[one.name] for one in positions]
+    coupling = np.zeros((len(joints), len(robot.joints)))
+    for k, one in enumerate(positions):
+        coupling[k, one.joint] = one.factor
+    offsets = np.array([one.offset for one in positions])
     beside = {}
     for k in moving:
         low, high = infos[k][8:10]
         if k not in joints:
             beside[k] = min(max(0.0, low), high) if low < high else 0.0
             bullet.resetJointState(body, k, beside[k], physicsClientId=client)
-    return LoadedRobot(body, joints, links[robot.flange], beside, moving)
+    return LoadedRobot(body, joints, coupling, offsets, links[robot.flange], beside, moving)
 
 
 class PybulletPlant(RigidPlant):
@@ -121,15 +128,15 @@ class PybulletPlant(RigidPlant):
         if self._client < 0:
             raise PhysicsError("pybullet refuses another simulation in this process")
         self._step_s = step_s
-        self._count = len(robot.joints)
-        self._forces = [MAX_TORQUE] * self._count
-        self._gains = [POSITION_GAIN] * self._count
-        self._velocity_gains = [1.0] * self._count
         self._bullet.setTimeStep(step_s, physicsClientId=self._client)
         self._mounted = robot.mounted[:3, :3]
         self._pull(GRAVITY)
         loaded = load_robot(self._bullet, self._client, robot)
         self._loaded, self._arm, self._joints = loaded, loaded.body, loaded.joints
+        self._forces = [MAX_TORQUE] * len(loaded.joints)
+        self._gains = [POSITION_GAIN] * len(loaded.joints)
+        self._velocity_gains = [1.0] * len(loaded.joints)
+        self._from_engine = np.linalg.pinv(loaded.coupling)
         for joint in loaded.moving:
             self._bullet.changeDynamics(
                 self._arm, joint, linearDamping=0, angularDamping=0, jointDamping=0, physicsClientId=self._client
@@ -151,18 +158,19 @@ class PybulletPlant(RigidPlant):
 
     def place(self, positions: FloatArray) -> None:
         """Set the joints to ``positions`` (n,), at rest, without motion."""
-        for joint, position in zip(self._joints, positions.tolist(), strict=True):
+        own = self._loaded.coupling @ positions + self._loaded.offsets
+        for joint, position in zip(self._joints, own.tolist(), strict=True):
             self._bullet.resetJointState(self._arm, joint, position, physicsClientId=self._client)
         self.positions = positions.copy()
-        self.velocities = np.zeros(self._count)
+        self.velocities = np.zeros(len(positions))
         rests = [self._loaded.beside.get(joint, 0.0) for joint in self._loaded.moving]
-        for place, position in zip(self._places, positions.tolist(), strict=True):
+        for place, position in zip(self._places, own.tolist(), strict=True):
             rests[place] = position
         still = [0.0] * len(rests)
         self._pull(self._mounted.T @ GRAVITY)  # inverse dynamics takes the base's frame as the world's
         balanced = self._bullet.calculateInverseDynamics(self._arm, rests, still, still, physicsClientId=self._client)
         self._pull(GRAVITY)
-        self.efforts = np.array(balanced)[self._places]
+        self.efforts = np.array(balanced)[self._places] @ self._loaded.coupling
 
     def follow(self, set_positions: FloatArray, set_velocities: FloatArray, h: float) -> None:
         """Advance by ``h`` [s], one step of the engine, towards set-points (n,), (n,)."""
@@ -170,8 +178,8 @@ class PybulletPlant(RigidPlant):
             self._arm,
             self._joints,
             self._bullet.POSITION_CONTROL,
-            targetPositions=set_positions.tolist(),
-            targetVelocities=set_velocities.tolist(),
+            targetPositions=(self._loaded.coupling @ set_positions + self._loaded.offsets).tolist(),
+            targetVelocities=(self._loaded.coupling @ set_velocities).tolist(),
             forces=self._forces,
             positionGains=self._gains,
             velocityGains=self._velocity_gains,
@@ -179,9 +187,10 @@ class PybulletPlant(RigidPlant):
         )
         self._bullet.stepSimulation(physicsClientId=self._client)
         states = self._bullet.getJointStates(self._arm, self._joints, physicsClientId=self._client)
-        self.positions = np.array([state[0] for state in states])
-        self.velocities = np.array([state[1] for state in states])
-        self.efforts = np.array([state[3] for state in states])
+        own = np.array([(state[0], state[1], state[3]) for state in states])
+        self.positions = self._from_engine @ (own[:, 0] - self._loaded.offsets)
+        self.velocities = self._from_engine @ own[:, 1]
+        self.efforts = own[:, 2] @ self._loaded.coupling
 
     def flange(self) -> FloatArray:
         """Pose (4, 4) of the flange as computed by the engine, for checks against the closed form."""

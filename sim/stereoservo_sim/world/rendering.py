@@ -498,7 +498,8 @@ class PybulletBackdrop(Backdrop):
 
     def draw(self, q: FloatArray) -> ImageArray:
         """Image of the arm at ``q`` (n,) [rad]."""
-        for joint, position in zip(self._loaded.joints, q.tolist(), strict=True):
+        own = self._loaded.coupling @ q + self._loaded.offsets
+        for joint, position in zip(self._loaded.joints, own.tolist(), strict=True):
             self._bullet.resetJointState(self._loaded.body, joint, position, physicsClientId=self._client)
         camera = self._cell.in_world(self._camera, q)
         view = (np.diag([1.0, -1.0, -1.0, 1.0]) @ camera.world_to_camera).T.ravel().tolist()

@@ -6,13 +6,15 @@ This is the simulation's ground truth. The service never sees it; it learns the 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 from stereoservo.ports.devices import JointSpec
 
+SHORTEST = 1e-3
+"""Least length between the end points of a capsule [m]; a sphere is a capsule of this length."""
 NO_EXTENT = 0.02
 """Radius [m] assumed for the inertia of a link without shapes."""
 
@@ -27,6 +29,17 @@ class Capsule:
     radius: float
 
 
+class UrdfPosition(NamedTuple):
+    """Position of a URDF's joint ``name``: ``factor`` times that of the robot's joint of index ``joint``, plus
+    ``offset`` [rad or m].
+    """
+
+    name: str
+    joint: int
+    factor: float = 1.0
+    offset: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class Robot:
     """A serial arm of ``n`` joints, each about or along the z axis of its frame.
@@ -36,8 +49,8 @@ class Robot:
     ``links`` (n, 4, 4): from each joint's frame, moved, to the next one's at its zero, the last to the flange.
     ``masses`` (n,) [kg] and ``centres`` (n, 3) [m] of the links in their joints' frames.
     ``shapes``: those of link 0 are in the world.
-    ``file``: the URDF that it was read from, mounted at ``mounted`` (4, 4) in the world, with the flange at its link
-    ``flange``; ``notes``: what is omitted of it.
+    ``text``: the URDF that it was read from, for physics and images, mounted at ``mounted`` (4, 4) in the world, with
+    the flange at its link ``flange`` and its joints at ``positions``; ``notes``: what is odd or omitted of it.
     """
 
     name: str
@@ -47,7 +60,8 @@ class Robot:
     masses: FloatArray
     centres: FloatArray
     shapes: tuple[Capsule, ...]
-    file: Path | None = None
+    text: str = ""
+    positions: tuple[UrdfPosition, ...] = ()
     mounted: FloatArray = field(default_factory=lambda: np.eye(4))
     flange: str = "flange"
     notes: tuple[str, ...] = ()
@@ -145,6 +159,40 @@ def urdf(robot: Robot) -> str:
 
 def _numbers(values: FloatArray) -> str:
     return " ".join(f"{float(value):.17g}" for value in values)
+
+
+def rotation_to_axis(axis: FloatArray) -> FloatArray:
+    """Rotation (4, 4) whose z is along ``axis``."""
+    z = axis / np.linalg.norm(axis)
+    turn = np.eye(4)
+    if z[2] > 1.0 - 1e-12:
+        return turn
+    x = np.cross(np.eye(3)[int(np.abs(z).argmin())], z)
+    x /= np.linalg.norm(x)
+    turn[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    return turn
+
+
+def capsule_around(link: int, points: FloatArray) -> Capsule:
+    """The slimmest capsule around points (k, 3), among those along the coordinate axes and the longest extent."""
+    middle = 0.5 * (points.max(axis=0) + points.min(axis=0))
+    spread = points - middle
+    longest = np.linalg.eigh(spread.T @ spread)[1][:, -1]
+    best: tuple[float, Capsule] | None = None
+    for axis in (*np.eye(3), longest):
+        along = spread @ axis
+        across = spread - along[:, None] * axis
+        centre = 0.5 * (across.max(axis=0) + across.min(axis=0))
+        radius = float(np.linalg.norm(across - centre, axis=1).max())
+        low, high = float(along.min()) + radius, float(along.max()) - radius
+        if high - low < SHORTEST:
+            low, high = 0.5 * (low + high - SHORTEST), 0.5 * (low + high + SHORTEST)
+        start, end = (middle + centre + at * axis for at in (low, high))
+        volume = radius**2 * (high - low + 4.0 / 3.0 * radius)
+        if best is None or volume < best[0]:
+            best = volume, Capsule(link, tuple(start.tolist()), tuple(end.tolist()), max(radius, SHORTEST))
+    assert best is not None
+    return best[1]
 
 
 def roll_pitch_yaw(pose: FloatArray) -> FloatArray:

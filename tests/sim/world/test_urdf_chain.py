@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,8 +13,10 @@ import numpy as np
 import pytest
 
 from stereoservo.cli import main as cli
-from stereoservo_sim.world.arms.arm_cell import UrdfError, load_urdf, urdf_path
-from stereoservo_sim.world.robots import Robot
+from stereoservo_sim.world.arms.arm_cell import urdf_path
+from stereoservo_sim.world.physics import PybulletPlant
+from stereoservo_sim.world.robots import Robot, flange_pose
+from stereoservo_sim.world.urdf_file import MOST_MESH_BYTES, UrdfError, load_urdf
 
 from ...corrupted import corrupted_copies
 
@@ -28,6 +32,9 @@ class Row:
     kind: str = "revolute"
     mimics: str = ""
     child: str = ""
+    axis: str = "0 1 0"
+    limit: str = LIMIT
+    multiplier: float = -1.0
 
     @property
     def link(self) -> str:
@@ -35,11 +42,11 @@ class Row:
 
     @property
     def text(self) -> str:
-        mimic = f'<mimic joint="{self.mimics}" multiplier="-1"/>' if self.mimics else ""
-        limit = "" if self.kind in ("fixed", "continuous") else LIMIT
+        mimic = f'<mimic joint="{self.mimics}" multiplier="{self.multiplier}" offset="0.1"/>' if self.mimics else ""
+        limit = "" if self.kind in ("fixed", "continuous") else self.limit
         return (
             f'<joint name="{self.name}" type="{self.kind}"><parent link="{self.parent}"/><child link="{self.link}"/>'
-            f'<origin xyz="0 0 0.1"/><axis xyz="0 1 0"/>{limit}{mimic}</joint>'
+            f'<origin xyz="0 0 0.1"/><axis xyz="{self.axis}"/>{limit}{mimic}</joint>'
         )
 
 
@@ -68,20 +75,82 @@ SO101 = [
 """The shape of the SO-101's own file: a tool frame and one jaw on the last link."""
 
 
-def test_a_mimic_joint_on_the_way_to_the_flange_is_refused(tmp_path: Path) -> None:
-    """A telescope's second stage; also where the flange is named, and at the very end."""
-    rows = [
-        *serial("lift"),
-        Row("stage2", "lift_link", "prismatic", "lift"),
-        *serial("j1", "j2", root="stage2_link"),
-    ]
-    for flange in ("", "j2_link", "stage2_link"):
-        with pytest.raises(UrdfError, match=r"'stage2' mimics 'lift'.*mimic joints.*flange = 'lift_link'") as caught:
-            robot_of(tmp_path, rows, flange)
-        assert "arm.urdf" in str(caught.value)
-    with pytest.raises(UrdfError, match="'stage2' mimics 'lift'"):
-        robot_of(tmp_path, rows[:2])
-    assert robot_of(tmp_path, rows, "lift_link").joint_names == ("lift",)
+@pytest.mark.parametrize(
+    ("rows", "how"),
+    [
+        ([*serial("lift"), Row("c", "lift_link", "prismatic", "lift")], "along or about another line"),
+        ([*serial("a"), Row("c", "a_link", mimics="a", axis="1 0 0")], "along or about another line"),
+        ([*serial("a"), Row("c", "a_link", mimics="a")], "along or about another line"),  # a parallelogram
+        ([*serial("a", "b"), Row("c", "b_link", mimics="a")], "with joints of the arm between them"),
+        ([Row("a", "base", axis="0 0 1"), Row("c", "a_link", mimics="a", axis="0 0 1")], "so that nothing moves"),
+    ],
+)
+def test_mimic_joints_that_are_no_single_joint_are_refused(tmp_path: Path, rows: list[Row], how: str) -> None:
+    """Also where the flange is named; and the remedy works."""
+    for flange in ("", "j2_link", "c_link"):
+        with pytest.raises(UrdfError, match=rf"arm.urdf.*'c' mimics '.*{how}.*driven.*flange = '(\w+)'") as caught:
+            robot_of(tmp_path, [*rows, *serial("j1", "j2", root="c_link")], flange)
+    before = re.search(r"flange = '(\w+)'", str(caught.value))
+    assert before is not None
+    assert robot_of(tmp_path, rows, before[1]).joint_names == tuple(row.name for row in rows[:-1])
+
+
+COLUMN = [
+    Row("lift", "base", "prismatic", axis="0 0 1"),
+    Row("stage2", "lift_link", "prismatic", "lift", axis="0 0 2", multiplier=0.5),
+]
+TURNTABLE = [
+    Row("turn", "base", axis="0 0 1"),
+    Row("again", "turn_link", mimics="turn", axis="0 0 -1", multiplier=-2.0, limit=""),
+]
+
+
+@pytest.mark.parametrize(("rows", "limit"), [(COLUMN, 1.5), (TURNTABLE, 3.0)])
+def test_coupled_joints_are_one_joint_that_moves_both(tmp_path: Path, rows: list[Row], limit: float) -> None:
+    """A telescope, and two turns about one line: kinematics, limits, and the engine's own joints."""
+    robot = robot_of(tmp_path, [*rows, *serial("j1", "j2", root=rows[1].link)])
+    assert robot.joint_names == (rows[0].name, "j1", "j2")
+    assert robot.joints[0].position_max == pytest.approx(limit)
+    engine = PybulletPlant(robot, np.zeros(3), 1e-3)
+    try:
+        for q in np.random.default_rng(0).uniform(-0.9, 0.9, (5, 3)):
+            engine.place(q)
+            assert np.abs(engine.flange() - flange_pose(robot, q)).max() < 1e-6
+        engine.place(np.zeros(3))
+        for s in np.linspace(0.0, 1.0, 200):
+            engine.follow(np.array([0.3 * s, 0.0, 0.0]), np.array([1.5, 0.0, 0.0]), 1e-3)
+        assert engine.positions == pytest.approx([0.3, 0.0, 0.0], abs=0.02)
+        assert np.abs(engine.flange() - flange_pose(robot, engine.positions)).max() < 5e-3
+    finally:
+        engine.close()
+
+
+DATA = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shared" / "data"))
+
+
+def reported(name: str) -> Path:
+    path = DATA / "reports" / name
+    if not path.is_file():
+        pytest.skip(f"no reports/{name} in ../shared/data or $STEREOSERVO_DATA")
+    return path
+
+
+def test_the_reported_telescope_has_one_lift() -> None:
+    path = reported("case_01_mimic_joint_on_the_chain/telescope.urdf")
+    robot = load_urdf(path)
+    assert robot.joint_names == ("lift", *(f"j{k}" for k in range(1, 7)))
+    assert (robot.joints[0].position_min, robot.joints[0].position_max) == pytest.approx((0.0, 0.7))
+    high, low = (flange_pose(robot, np.array([q, *np.zeros(6)]))[2, 3] for q in (0.7, 0.0))
+    assert high - low == pytest.approx(0.7)
+
+
+def test_the_reported_torso_names_its_arms() -> None:
+    path = reported("case_03_two_arms_no_flange/two_arms.urdf")
+    with pytest.raises(UrdfError) as caught:
+        load_urdf(path)
+    flanges = re.findall(r"flange = '(\w+)' \(6 joints\)", str(caught.value))
+    assert flanges == ["left_l6", "right_l6"]
+    assert [load_urdf(path, flange=flange).joints[0].name for flange in flanges] == ["left_j1", "right_j1"]
 
 
 def test_a_single_jaw_is_left_out_and_that_is_told(tmp_path: Path) -> None:
@@ -126,8 +195,7 @@ def test_fingers_are_left_out_and_that_is_told(tmp_path: Path) -> None:
     assert len(robot.notes) == 1
     assert "'f1', 'f2' are left out" in robot.notes[0]
     assert "flange = 'f1_link'" in robot.notes[0]
-    with pytest.raises(UrdfError, match="'f2' mimics 'f1'"):
-        robot_of(tmp_path, [*ARM, *fingers], "f2_link")
+    assert robot_of(tmp_path, [*ARM, *fingers], "f2_link").joint_names[-1] == "f2"
 
 
 @pytest.mark.parametrize("before", [0, 1, 3])
@@ -137,11 +205,10 @@ def test_several_arms_are_refused_with_the_flanges_to_choose_from(tmp_path: Path
     root = f"t{before - 1}_link" if before else "base"
     arms = [serial(*(f"{side}{k}" for k in range(6)), root=root) for side in ("left", "right")]
     rows = [*torso, *arms[0], *arms[1], *serial("head", root=root)]
-    with pytest.raises(UrdfError, match="branches into several arms") as caught:
+    with pytest.raises(UrdfError, match="several arms") as caught:
         robot_of(tmp_path, rows)
     flanges = re.findall(r"flange = '(\w+)'", str(caught.value))
     assert flanges[:2] == ["left5_link", "right5_link"]
-    assert repr(root) in str(caught.value)
     robot = robot_of(tmp_path, rows, flanges[1])
     assert len(robot.joints) == before + 6
     assert "'left0'" in robot.notes[0]
@@ -159,14 +226,18 @@ def test_a_linkage_that_an_arm_carries_ends_it_not(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("rows", "told"),
     [
-        ([*ARM, Row("j6", "j5_link", "floating")], "'floating'; revolute, .* where it stands"),
-        ([Row("world", "map", "planar", child="base"), *ARM], "'planar'; revolute, continuous"),
+        ([*ARM, Row("j6", "j5_link", "floating"), Row("j7", "j6_link")], "'floating' .* revolute, .* where it stands"),
+        ([Row("world", "map", "screw", child="base"), *ARM], "'screw' .* revolute, continuous"),
         ([*ARM, Row("j6", "j5_link", mimics="nobody")], "'j6' mimics 'nobody'; joints beside it: j1, j2"),
         ([*ARM, Row("j6", "j5_link", mimics="j6")], "'j6' mimics 'j6'"),
         ([*ARM, Row("j5", "j5_link", child="other")], "two joints are named 'j5'"),
         ([*ARM, Row("j6", "j1_link", child="j5_link")], "child of joints 'j5' and 'j6'; closed chains"),
         ([Row("a", "x", child="y"), Row("b", "y", child="x"), *ARM], "below itself"),
-        ([*ARM, *serial("k1", root="other")], r"2 links without a parent \('base', 'other'\)"),
+        ([*ARM, *serial(*"abcde", root="other")], "several arms.*'j5_link' .5 joints. or flange = 'e_link'"),
+        ([*ARM, Row("j6", "j5_link", axis="0 0 0")], "'j6': its axis"),
+        ([*ARM, Row("j6", "j5_link", limit='<limit lower="1" upper="0"/>')], "'j6': limits 1 to 0"),
+        ([*ARM, Row("j6", "j5_link", limit='<limit lower="nan" upper="0"/>')], "'j6': <limit lower='nan'>"),
+        ([*ARM, Row("j6", "j5_link", limit='<limit lower="${low}" upper="0"/>')], "'j6': .* xacro FILE"),
     ],
 )  # fmt: skip
 def test_what_is_no_tree_of_known_joints_is_refused(tmp_path: Path, rows: list[Row], told: str) -> None:
@@ -175,11 +246,102 @@ def test_what_is_no_tree_of_known_joints_is_refused(tmp_path: Path, rows: list[R
     assert "arm.urdf" in str(caught.value)
 
 
-def test_endless_joints_are_read_and_may_be_long(tmp_path: Path) -> None:
-    robot = robot_of(tmp_path, [Row("turn", "base", "continuous"), *serial("j1", root="turn_link")])
-    assert robot.joints[0].position_max == pytest.approx(2 * np.pi)
-    long = robot_of(tmp_path, serial(*(f"j{k}" for k in range(3000))))
-    assert len(long.joints) == 3000
+@pytest.mark.parametrize(
+    ("row", "highest", "told"),
+    [
+        (Row("j6", "j5_link", limit='<limit effort="1" velocity="1"/>'), 2 * np.pi, "no limits are stated"),
+        (Row("j6", "j5_link", limit=""), 2 * np.pi, "no limits are stated"),
+        (Row("j6", "j5_link", "prismatic", limit='<limit lower="0" upper="0"/>'), 1.0, "no limits are stated"),
+        (Row("j6", "j5_link", limit='<limit lower="-170" upper="90"/>'), np.pi / 2, "-170 to 90 are taken for degrees"),
+        (Row("j6", "j5_link", limit='<limit lower="-1e16" upper="1e16"/>'), 2 * np.pi, "are many turns"),
+        (Row("j6", "j5_link", " Continuous "), 2 * np.pi, ""),
+    ],
+)
+def test_limits_as_exporters_write_them(tmp_path: Path, row: Row, highest: float, told: str) -> None:
+    robot = robot_of(tmp_path, [*ARM, row])
+    assert robot.joints[-1].position_max == pytest.approx(highest)
+    assert [told in note for note in robot.notes] == ([True] if told else [])
+
+
+def test_what_is_beside_the_arm_or_before_it_stands_still_and_is_told(tmp_path: Path) -> None:
+    """A base that drives, wheels, a head, a link without a joint; limits and axes beside the arm do not matter."""
+    wheel = Row("wheel", "base", "continuous", axis="0 0 0")
+    rows = [
+        Row("drive", "map", "planar", child="base"), wheel, Row("caster", "base", limit='<limit lower="1" upper="0"/>'),
+        *ARM, Row("pan", "j1_link"), Row("box", "j3_link", "floating"), Row("x", "loose", "fixed", child="frame"),
+    ]  # fmt: skip
+    robot = robot_of(tmp_path, rows)
+    assert robot.joint_names == ("j1", "j2", "j3", "j4", "j5")
+    told = " ".join(robot.notes)
+    assert all(f"{name!r}" in told for name in ("drive", "wheel", "caster", "pan", "box"))
+    assert "links that no joint connects to the arm are left out, with what is below: loose" in told
+
+
+@pytest.mark.parametrize(
+    ("encoded", "told"),
+    [
+        (lambda text: text.encode("utf-8-sig"), ""),
+        (lambda text: text.encode("utf-16"), ""),
+        (lambda text: text.encode("utf-16-be"), ""),
+        (lambda text: text.encode("cp1252"), "line 2 is not UTF-8"),
+        (lambda text: text.replace("utf-8", "cp1252").encode("cp1252"), ""),
+        (lambda text: ("\r\n " + text).encode() + b"\0\0", ""),
+    ],
+)
+def test_files_of_any_encoding_are_read(tmp_path: Path, encoded: Callable[[str], bytes], told: str) -> None:
+    joint = Row("Gelenk_ä", "base", child="hand").text.replace("<joint", "<joint xyz:undeclared='1'")
+    text = f'<?xml version="1.0" encoding="utf-8"?>\n<robot name="Müller"><link name="base"/><link name="hand"/>{joint}'
+    (tmp_path / "arm.urdf").write_bytes(encoded(text + "</robot>"))
+    robot = load_urdf(tmp_path / "arm.urdf")
+    assert (robot.name, robot.joint_names) == ("Müller", ("Gelenk_ä",))
+    assert [told in note for note in robot.notes] == ([True] if told else [])
+
+
+MESHED = """<robot name="arm"><link name="a"/><link name="b"><visual><geometry><mesh filename="{}"/></geometry></visual>
+</link><joint name="j" type="continuous"><parent link="a"/><child link="b"/></joint></robot>"""
+
+
+@pytest.mark.parametrize(
+    ("named", "at", "found"),
+    [
+        ("../meshes/part.obj", "pkg/meshes/part.obj", True),
+        ("package://pkg/meshes/part.obj", "pkg/meshes/part.obj", True),
+        ("package://pkg/meshes/part.obj", "pkg/urdf/meshes/part.obj", True),  # copied with its meshes
+        ("package://other/part.obj", "other/part.obj", True),
+        ("file:///home/maker/ws/meshes/part.obj", "pkg/urdf/part.obj", True),
+        ("C:\\ws\\meshes\\part.obj", "pkg/urdf/meshes/part.obj", True),
+        ("../../part.obj", "part.obj", False),
+        ("package://pkg/../part.obj", "part.obj", False),
+        ("/dev/zero", "part.obj", False),
+        ("large.obj", "pkg/urdf/large.obj", False),
+        ("pipe.obj", "", False),
+    ],
+)
+def test_meshes_are_taken_from_the_files_own_tree_alone(tmp_path: Path, named: str, at: str, found: bool) -> None:
+    folder = tmp_path / "pkg/urdf"
+    for place in (folder, tmp_path / "other"):
+        place.mkdir(parents=True)
+        (place.parent / "package.xml" if place is folder else place / "package.xml").touch()
+    os.mkfifo(folder / "pipe.obj")
+    if at:
+        (tmp_path / at).parent.mkdir(exist_ok=True, parents=True)
+        (tmp_path / at).write_bytes(OBJ)
+    if at.endswith("large.obj"):
+        os.truncate(tmp_path / at, MOST_MESH_BYTES + 1)
+    (folder / "arm.urdf").write_text(MESHED.format(named))
+    robot = load_urdf(folder / "arm.urdf")
+    assert bool(robot.shapes) == found
+    assert (str(tmp_path / at) in robot.text) == found
+    assert [Path(named).name in note for note in robot.notes] == ([] if found else [True])
+
+
+def test_an_arm_of_too_many_joints_is_refused_with_a_flange_that_works(tmp_path: Path) -> None:
+    rows = serial(*(f"j{k}" for k in range(1500)))
+    with pytest.raises(UrdfError, match=r"1500 joints .* at most 12\. Valid: flange = '(\w+)'") as caught:
+        robot_of(tmp_path, rows)
+    flange = re.search(r"Valid: flange = '(\w+)'", str(caught.value))
+    assert flange is not None
+    assert len(robot_of(tmp_path, rows, flange[1]).joints) == 12
 
 
 CELL = """schema = 1
@@ -218,10 +380,10 @@ def test_doctor_tells_what_is_left_out_and_refuses_what_is_not_driven(
     assert code == 0
     (note,) = [check["message"] for check in result["checks"] if check["name"] == "arm"]
     assert "flange = 'gripper_link' makes it a joint of the arm" in note
-    coupled = source.replace("</joint>", '<mimic joint="gripper"/></joint>', 1)
+    coupled = source.replace("</joint>", '<mimic joint="nobody"/></joint>', 1)
     code, result = told("coupled.urdf", coupled)
     assert code == 1
-    assert "mimics 'gripper' and is on the way to the flange" in result["error"]["message"]
+    assert "mimics 'nobody'; joints beside it" in result["error"]["message"]
 
 
 WHOLE = f"""<?xml version="1.0"?>
