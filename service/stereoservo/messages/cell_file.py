@@ -15,7 +15,7 @@ from msgspec import Meta
 from stereoservo.messages.addresses import keep_secret, redacted, without_secrets
 from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 from stereoservo.messages.known_length import known_length_of
-from stereoservo.messages.text_files import Remark, listed, toml_of
+from stereoservo.messages.text_files import Remark, complete, toml_of
 
 SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
@@ -260,12 +260,11 @@ def load_cell_file(path: Path, remarks: list[Remark] | None = None) -> CellFile:
     """
     try:
         tree, odd = toml_of(path.read_bytes())
+        complete((tree, odd))  # a limit may be among what is missing
     except OSError as error:
         raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
-    except ValueError as error:  # of TOML, or numbers with thousands of digits
+    except ValueError as error:
         raise CellFileError(path, "", f"is not TOML: {error}") from error
-    if lost := [remark for remark in odd if remark.lost]:  # a limit may be among what is missing
-        raise CellFileError(path, "", f"is not TOML: {listed(lost)}")
     if remarks is not None:
         remarks += odd
     return check_cell(tree, path)

@@ -10,7 +10,7 @@ import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 
@@ -40,6 +40,17 @@ def listed(remarks: Iterable[Remark]) -> str:
     texts = [str(remark) for remark in remarks]
     more = [f"{len(texts) - MOST_NAMED} more"] if len(texts) > MOST_NAMED else []
     return "; ".join(texts[:MOST_NAMED] + more)
+
+
+_Content = TypeVar("_Content")
+
+
+def complete(read: tuple[_Content, list[Remark]]) -> _Content:
+    """The content of a file of which nothing may be missing. Raises ValueError that lists what was left out."""
+    content, remarks = read
+    if lost := [remark for remark in remarks if remark.lost]:
+        raise ValueError(listed(lost))
+    return content
 
 
 # -- bytes to text --------------------------------------------------------------------------------------------
