@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.examination.examination import RecordingReport, examine_views
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
-from stereoservo.calibration.trial_data import TrialCamera
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
 from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.state_encoding import StateVersionError, decode_state
 from stereoservo.kinematics.model import CellModel
@@ -70,7 +70,10 @@ def examine(
         views = read_flight(dataset)
     else:
         raise CommandError("dataset", f"{dataset} is no flight recording (*.mcap), folder or LeRobot data set")
-    report = examine_views(views)
+    try:
+        report = examine_views(views)
+    except CalibrationError as error:
+        raise CommandError(error.code, "; ".join((str(error), *views.notes)), notes=views.notes) from error
     emit(report, _text(report), json)
 
 
@@ -222,7 +225,8 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     names, kinds, scales, columns = lerobot.joints_of(lerobot.state_names(info, folder), units)
     wanted = None if cameras is None else [name.strip() for name in cameras.split(",")]
     keys = lerobot.camera_features(info, folder, wanted)
-    rows = lerobot.read_rows(folder, info)
+    losses: list[lerobot.Loss] = []
+    rows = lerobot.read_rows(folder, info, losses=losses)
     stamps, joint_times, states = _one_clock(rows)
     every = max(1, -(-len(rows.stamp) * len(keys) // MOST_FRAMES))
     if every > 1:
@@ -233,8 +237,12 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
         least = COMPRESSED_PX if info.features[key].dtype == "video" else 0.0
         seen: dict[float, tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
         size = None
-        for row, decoded in lerobot.pictures(folder, info, key, rows, every, gray=True):
-            image = decoded()
+        for row, decoded in lerobot.pictures(folder, info, key, rows, every, gray=True, losses=losses):
+            try:
+                image = decoded()
+            except lerobot.DataSetError as error:
+                losses.append(lerobot.Loss(str(error), name, int(rows.episode[row]), int(rows.frame[row])))
+                continue
             size, before = (image.shape[1], image.shape[0]), size
             if before not in (None, size):
                 raise CommandError("dataset", f"LeRobot data set {folder}: {key}: a picture of {size} after {before}")
@@ -253,8 +261,9 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
         raise CommandError(
             "dataset",
             f"LeRobot data set {folder}: no camera shows a marker that the detector looks for; its cameras are "
-            f"{', '.join(keys) or 'none'}",
+            f"{', '.join(keys) or 'none'}" + "".join(f"; {text}" for text in lerobot.described_losses(losses)),
         )
+    notes += lerobot.described_losses(losses)
     counted = bool(np.abs(rows.stamp - rows.frame / info.fps).max() < COUNTED_S)
     if counted:
         log("stamps are the count of frames over the rate: dropped frames cannot be told")
