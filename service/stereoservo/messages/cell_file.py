@@ -260,13 +260,13 @@ def load_cell_file(path: Path, remarks: list[Remark] | None = None) -> CellFile:
     """
     try:
         tree, odd = toml_of(path.read_bytes())
+        if remarks is not None:
+            remarks += odd
         complete((tree, odd))  # a limit may be among what is missing
     except OSError as error:
         raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise CellFileError(path, "", f"is not TOML: {error}") from error
-    if remarks is not None:
-        remarks += odd
     return check_cell(tree, path)
 
 

@@ -9,7 +9,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -379,10 +379,11 @@ def read_rows(folder: Path, info: Info, only: int | None = None, losses: list[Lo
 
 def pictures(
     folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False,
-    losses: list[Loss] | None = None,
+    losses: list[Loss] | None = None, stamps_only: bool = False,
 ) -> Generator[tuple[int, Picture], None, None]:  # fmt: skip
     """Every ``every``-th row and its image of one camera, in ``gray`` if requested. Raises DataSetError; with
-    ``losses``, which receives the images that are missing, only if none can be found.
+    ``losses``, which receives the images that are missing, only if none can be found. ``stamps_only``: those of videos
+    are looked for without decoding them, and their functions must not be called.
     """
     kept = range(0, len(rows.stamp), every)
 
@@ -404,7 +405,9 @@ def pictures(
             continue
         files.setdefault(path, []).append(_Wanted(begin_s + int(rows.frame[row]) / info.fps, row))
     for path, wanted in files.items():
-        yield from _decoded(path, sorted(wanted), rows, 1.0 / info.fps, lose, gray=gray)
+        period_s, wanted = 1.0 / info.fps, sorted(wanted)
+        frames = _stamps(path) if stamps_only else _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
+        yield from _decoded(path, wanted, rows, period_s, frames, lose, gray=gray)
 
 
 def _video_places(folder: Path, info: Info, key: str, losses: list[Loss] | None) -> Callable[[int], tuple[Path, float]]:
@@ -445,10 +448,10 @@ def _video_places(folder: Path, info: Info, key: str, losses: list[Loss] | None)
 
 
 def _decoded(
-    path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, lose: Lose, *, gray: bool
-) -> Iterator[tuple[int, Picture]]:
-    """Images of a video at their times; ``lose`` is called for those that it lacks, or that cannot be decoded."""
-    frames = _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
+    path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, frames: Iterator[tuple[float, Any]],
+    lose: Lose, *, gray: bool,
+) -> Iterator[tuple[int, Picture]]:  # fmt: skip
+    """Images among a video's ``frames`` at their times; ``lose`` is called for those that are missing or damaged."""
     last_s, now_s, frame = -math.inf, -math.inf, None
     broken: DataSetError | None = None
     for one in wanted:
@@ -476,8 +479,9 @@ def _decoded(
         yield one.row, take
 
 
-def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
-    """Times [s] and frames of a video, starting at the key frame at or before ``from_s``."""
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A video's container, in which there is a video. Raises DataSetError, also for errors inside."""
     import av  # of the extra that also brings pyarrow: see missing_extra
 
     if not os.path.isfile(path):  # also for a name that the system does not accept
@@ -485,6 +489,20 @@ def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, Non
     with _reading(path), av.open(str(path)) as container:
         if not container.streams.video:
             raise DataSetError("dataset", f"{path}: holds no video")
+        yield container
+
+
+def _stamps(path: Path) -> Iterator[tuple[float, None]]:
+    """Times [s] of a video's frames, without decoding them."""
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        stamps = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
+        yield from ((float(stamp * stream.time_base), None) for stamp in sorted(stamps))
+
+
+def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
+    """Times [s] and frames of a video, starting at the key frame at or before ``from_s``."""
+    with _opened(path) as container:
         stream = container.streams.video[0]
         if from_s > 0.0:
             container.seek(math.floor(from_s / stream.time_base), stream=stream)

@@ -15,17 +15,27 @@ import msgspec
 import typer
 
 from stereoservo.cli.doctor.cameras import examine_cameras
+from stereoservo.cli.doctor.files import examine_place, kind_of, remark_findings
 from stereoservo.cli.doctor.joints import examine_joints, permission
-from stereoservo.cli.output import CommandError, JsonOption, coloured, emit, shipped_or_path
+from stereoservo.cli.output import (
+    CommandError,
+    JsonOption,
+    code_of,
+    coloured,
+    emit,
+    is_known_error,
+    shipped_or_path,
+)
 from stereoservo.client import SessionError
 from stereoservo.daemon.cell_preparation import make_plan
 from stereoservo.daemon.ipc_messages import PlanOptions, RunPlan
 from stereoservo.daemon.taught_goals import TaughtFileError, load_taught
 from stereoservo.gateway.persistence import ModelStore
 from stereoservo.gateway.zenoh_config import gateway_config
-from stereoservo.messages.cell_file import load_cell_file
+from stereoservo.messages.cell_file import CellFileError, load_cell_file
 from stereoservo.messages.directories import CellDirectories, cell_directories, create_directories
 from stereoservo.messages.locks import holder
+from stereoservo.messages.text_files import Remark
 from stereoservo.ports.devices import ExaminationFinding, MayMove
 
 LOW_DISK_BYTES = 500_000_000
@@ -33,7 +43,12 @@ LOW_DISK_BYTES = 500_000_000
 
 def doctor(
     cell: Annotated[
-        str, typer.Argument(metavar="NAME|PATH", help="A cell file (.toml), or the name of a shipped one.")
+        str,
+        typer.Argument(
+            metavar="NAME|PATH|URL",
+            help="A cell file, or the name of a shipped one; an EDS, DCF, URDF, model, flight recording, LeRobot set, "
+            "or folder of pictures; the URL of a stream.",
+        ),
     ],
     jog: Annotated[
         bool, typer.Option("--jog", help="Also turn each joint by one degree and back, once allowed: checks its units.")
@@ -48,23 +63,35 @@ def doctor(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Check cell file, drivers, drives, cameras, directories, wire, model and scheduling. Nothing moves without
-    ``--jog``; drives and cameras are asked only while no daemon has them.
+    """Check a cell: its file, drivers, drives, cameras, directories, wire, model and scheduling; or any other file that
+    is read: what it is, what is in it, what is odd.
+
+    Of a cell, nothing moves without ``--jog``; drives and cameras are asked only while no daemon has them. The kind of
+    a file is found by its content. Exits 0 where it can be used.
     """
     may_move = permission(jog, yes)
-    path = shipped_or_path(cell)
-    findings = []
-    for finding in examine_cell(path, may_move, seconds, pictures):
-        findings.append(finding)
-        if not json:
-            emit(None, line_of(finding), False)
+    kind, found = "cell file", None
+    if "://" in cell or Path(cell).exists() or Path(cell).suffix not in ("", ".toml"):
+        recognised, place = kind_of(cell, seconds)
+        kind = recognised.name.partition(" (")[0]
+        found = None if recognised.described is None else examine_place(recognised, place)
+    findings: list[ExaminationFinding] = []
+    try:
+        for finding in found or examine_cell(shipped_or_path(cell), may_move, seconds, pictures):
+            findings.append(finding)
+            if not json:
+                emit(None, line_of(finding), False)
+    except Exception as error:
+        if not findings or not is_known_error(error):
+            raise
+        tree = msgspec.to_builtins(findings)
+        raise CommandError(code_of(error), str(error), kind=kind, checks=tree) from error
     failed = [finding for finding in findings if finding.ok is False]
     if failed:
         tree = msgspec.to_builtins(findings)
-        raise CommandError(
-            "checks_failed", "; ".join(f"{finding.name}: {finding.message}" for finding in failed), checks=tree
-        )
-    emit({"checks": findings}, "", json)
+        message = "; ".join(f"{finding.name}: {finding.message}" for finding in failed)
+        raise CommandError("checks_failed", message, kind=kind, checks=tree)
+    emit({"kind": kind, "checks": findings}, "", json)
 
 
 def examine_cell(path: Path, may_move: MayMove, seconds: float, pictures: Path | None) -> Iterator[ExaminationFinding]:
@@ -81,14 +108,19 @@ def examine_cell(path: Path, may_move: MayMove, seconds: float, pictures: Path |
 
 def examine_file(path: Path) -> Generator[ExaminationFinding, None, tuple[RunPlan, CellDirectories]]:
     """Findings on a cell file and this computer; returns the plan of a run. Raises as :func:`examine_cell`."""
-    loaded = load_cell_file(path)
+    odd: list[Remark] = []
+    try:
+        loaded = load_cell_file(path, odd)
+    except CellFileError:
+        yield from remark_findings(path, odd, "correct this line: what it states is left out")
+        raise
     yield ExaminationFinding("cell file", True, f"{path} is valid in itself")
     directories = cell_directories(loaded.cell.name)
     create_directories(directories)
     plan = make_plan(path.absolute(), directories.runtime, directories.state, PlanOptions("doctor"))
     yield ExaminationFinding("drivers", True, _drivers(plan))
     for text in plan.joints.notes:
-        yield ExaminationFinding("arm", None, text)
+        yield ExaminationFinding("cell file" if text.startswith(f"{path.name}: ") else "arm", None, text)
     for check in CHECKS:
         yield check(plan, directories)
     return plan, directories
