@@ -24,7 +24,13 @@ from stereoservo.messages.text_files import Remark, decoded_text, json_of
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import lerobot, plugins
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import CountingCameraDriver, DriverContext, ExaminationFinding, JointDriverDescription
+from stereoservo.ports.devices import (
+    CountingCameraDriver,
+    DriverContext,
+    DriverError,
+    ExaminationFinding,
+    JointDriverDescription,
+)
 from stereoservo.recording.replay import RecordingError, recorded_messages
 from stereoservo.recording.step_layout import decode_step
 from stereoservo.recording.step_messages import Fingerprint
@@ -142,7 +148,13 @@ def _urdf(place: Place) -> Findings:
 
 def _stream(place: Place) -> Findings:
     video, source = plugins.load(plugins.CAMERA_DRIVERS, "video"), {"source": place.given}
-    width, height, rate_hz = video.probe_camera(source)
+    try:
+        width, height, rate_hz = video.probe_camera(source)
+    except DriverError as error:
+        if error.code != "image_size":
+            raise
+        size = dict(zip(("width", "height"), error.data["got"], strict=True))
+        width, height, rate_hz = video.probe_camera({**source, **size})
     message = f"{Address(place.given)}: {width}x{height} px at about {rate_hz:g} Hz"
     yield ExaminationFinding("pictures", True, message)
     if place.seconds <= 0:
@@ -225,6 +237,7 @@ def _data_set(place: Place) -> Findings:
         f"{name} {low:g} to {high:g}" for name, low, high in zip(states, *_ranges(rows.state), strict=True)
     )
     yield ExaminationFinding("states", True, f"{ranges}; their units are stated by `examine --units`")
+    total = 0
     for name, key in cameras.items():
         stored = info.features[key].dtype == "image"
         every = max(1, -(-len(rows.stamp) * len(cameras) // MOST_FRAMES)) if stored else 1
@@ -236,8 +249,13 @@ def _data_set(place: Place) -> Findings:
                 losses.append(lerobot.Loss(str(error), name, int(rows.episode[row]), int(rows.frame[row])))
         asked, shape = len(range(0, len(rows.stamp), every)), "x".join(map(str, info.features[key].shape))
         yield ExaminationFinding(
-            f"camera {name}", found > 0, f"{info.features[key].dtype}, {shape}: {found} of {asked} pictures"
+            f"camera {name}",
+            True if found else None,
+            f"{info.features[key].dtype}, {shape}: {found} of {asked} pictures",
         )
+        total += found
+    if not total:
+        yield ExaminationFinding("pictures", False, "no camera has any")
     for text in lerobot.described_losses(losses):
         yield ExaminationFinding("lost", None, text, "copy it again from its source; the rest is examined without it")
     if not (folder / DETECTOR).is_file():
