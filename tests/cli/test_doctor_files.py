@@ -14,7 +14,7 @@ import pytest
 from corrupted import corrupted_copies
 from drivers.video.conftest import HEIGHT, WIDTH, MjpegServer
 from lerobot_sets import Episode, write
-from stereoservo.cli.doctor.files import KINDS, examine_place, kind_of
+from stereoservo.cli.doctor.command import KINDS, examine_place, kind_of
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import is_known_error
 from stereoservo.daemon.kernel_compilation import example_model

@@ -378,9 +378,16 @@ def read_rows(folder: Path, info: Info, only: int | None = None, losses: list[Lo
 
 
 def pictures(
-    folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False,
-    losses: list[Loss] | None = None, stamps_only: bool = False,
-) -> Generator[tuple[int, Picture], None, None]:  # fmt: skip
+    folder: Path,
+    info: Info,
+    key: str,
+    rows: EpisodeRows,
+    every: int = 1,
+    *,
+    gray: bool = False,
+    losses: list[Loss] | None = None,
+    stamps_only: bool = False,
+) -> Generator[tuple[int, Picture], None, None]:
     """Every ``every``-th row and its image of one camera, in ``gray`` if requested. Raises DataSetError; with
     ``losses``, which receives the images that are missing, only if none can be found. ``stamps_only``: those of videos
     are looked for without decoding them, and their functions must not be called.
@@ -448,9 +455,15 @@ def _video_places(folder: Path, info: Info, key: str, losses: list[Loss] | None)
 
 
 def _decoded(
-    path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, frames: Iterator[tuple[float, Any]],
-    lose: Lose, *, gray: bool,
-) -> Iterator[tuple[int, Picture]]:  # fmt: skip
+    path: Path,
+    wanted: list[_Wanted],
+    rows: EpisodeRows,
+    period_s: float,
+    frames: Iterator[tuple[float, Any]],
+    lose: Lose,
+    *,
+    gray: bool,
+) -> Iterator[tuple[int, Picture]]:
     """Images among a video's ``frames`` at their times; ``lose`` is called for those that are missing or damaged."""
     last_s, now_s, frame = -math.inf, -math.inf, None
     broken: DataSetError | None = None
