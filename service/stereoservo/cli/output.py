@@ -194,19 +194,20 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def read_columns(path: Path, columns: tuple[str, ...], code: str) -> list[tuple[int, dict[str, str]]]:
-    """Rows of a table by their lines; what is odd in it is logged.
+    """Rows of a table with their lines, at least one; what is odd in it is logged.
 
-    Raises CommandError (``code``) if ``columns`` are missing.
+    Raises CommandError (``code``), also if ``columns`` are missing.
     """
     try:
-        table = table_of(read_file(path))
-    except ValueError as error:
-        raise CommandError(code, f"{path}: is no table: {error}") from error
+        table = table_of(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise CommandError(code, f"{path} cannot be read: {error}") from error
     for remark in table.remarks:
         log(f"{path}: {remark}")
     if missing := [name for name in columns if name not in table.columns]:
-        lacks, has = ", ".join(missing), ", ".join(table.columns)
-        raise CommandError(code, f"{path} has no column {lacks}; {','.join(columns)} are needed, it has {has}")
+        raise CommandError(code, f"{path} lacks columns {', '.join(missing)}; it has {', '.join(table.columns)}")
+    if not table.rows:
+        raise CommandError(code, "; ".join((f"{path} holds no row below its header", *map(str, table.remarks[:3]))))
     return table.rows
 
 

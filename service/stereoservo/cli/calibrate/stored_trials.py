@@ -202,8 +202,6 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
                 "px",
             )
         found[row["camera"]][row["line"]].append(pixel)
-    if not found:
-        raise CommandError("lines", f"{path}: holds no pixels; rows of camera,line,u,v are needed")
     lenses = {}
     for camera, of_camera in found.items():
         lines = [np.array(line) for line in of_camera.values()]
