@@ -6,7 +6,6 @@ hidden edges are not searched. The reported positions are measured in every fram
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +16,7 @@ import msgspec
 import numpy as np
 from msgspec import Meta
 
+from stereoservo.messages.text_files import complete, toml_of
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import Fields, kernel, plain
 from stereoservo.ports.devices import CameraObservation, DetectorDescription, DriverContext, DriverError, Frame, Prior
@@ -756,14 +756,14 @@ def load_part(path: Path, camera: str) -> tuple[Part, IntArray, FloatArray]:
         return DriverError("part", f"{path}: {text}", path=str(path))
 
     try:
-        tree: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+        tree: dict[str, Any] = complete(toml_of(path.read_bytes()))
         file = msgspec.convert(tree, PartFile, strict=True, str_keys=True)
     except OSError as error:
         raise refuse(f"the part file cannot be read: {error.strerror or error}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise refuse(f"no TOML: {error}") from error
     except msgspec.ValidationError as error:
         raise refuse(invalid(PartFile, tree, error)) from error
+    except ValueError as error:
+        raise refuse(f"no TOML: {error}") from error
     part = make_part(file, refuse)
     return part, *_start_of(file, part, camera, refuse)
 

@@ -165,18 +165,18 @@ def test_straight_lines_hold_the_lens(run: Run, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("left,line,u,v\n", "camera,line,u,v is needed"),
+        ("left,line,u,v\n", "lacks columns camera; it has left, line, u, v"),
         ("camera,line,u,v\ncam7,1,2,3\n", "no camera 'cam7'; cameras: cam0, cam1"),
-        ("camera,line,u,v\ncam0,1,2,x\n", "row 2: u and v are numbers"),
-        ("camera,line,u,v\ncam0,1,2,3,4\n", "row 2: has more than the four values"),
-        ("camera,line,u,v\ncam0,1,nan,3\n", "row 2: pixel (nan, 3) is outside the image of 640x480 px"),
-        ("camera,line,u,v\ncam0,1,1e20,3\n", "row 2: pixel (1e+20, 3) is outside the image of 640x480 px"),
+        ("camera,line,u,v\ncam0,1,2,x\n", "line 2: u and v are numbers"),
+        ("camera,line,u,v\ncam0,1,2,3,4\n", "line 2: 'cam0,1,2,3,4': 5 cells, 4 are needed"),
+        ("camera,line,u,v\ncam0,1,nan,3\n", "line 2: pixel (nan, 3) is outside the image of 640x480 px"),
+        ("camera,line,u,v\ncam0,1,1e20,3\n", "line 2: pixel (1e+20, 3) is outside the image of 640x480 px"),
         (
             "camera,line,u,v\ncam0,1,2,3\n",
             "lines of camera 'cam0' ('1', counted from 0): line 0 has 1 pixels",
         ),
-        ("camera,line,u,v\n", "holds no pixels"),
-        ("camera\xff", "is not UTF-8 text"),
+        ("camera,line,u,v\n", "holds no row below its header"),
+        ("camera\xff", "lacks columns camera, line, u, v"),
     ],
 )
 def test_bad_lines_are_named(run: Run, tmp_path: Path, text: str, said: str) -> None:

@@ -12,6 +12,7 @@ import msgspec
 import pytest
 
 from stereoservo.cli import main as cli
+from stereoservo.cli.doctor import cell as cell_module
 from stereoservo.cli.doctor import command
 from stereoservo.cli.doctor import joints as examination_module
 from stereoservo.cli.setup.command import in_fault
@@ -208,7 +209,7 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return msgspec.structs.replace(plan, joints=msgspec.structs.replace(plan.joints, simulated=False))
 
     monkeypatch.setattr(examination_module, "make_driver", make)
-    monkeypatch.setattr(command, "make_plan", real)
+    monkeypatch.setattr(cell_module, "make_plan", real)
     return told
 
 
@@ -259,7 +260,7 @@ def test_a_cell_with_one_camera_fails(cell: Path, capfd: pytest.CaptureFixture[s
 def test_a_damaged_file_of_taught_goals_is_a_finding(tmp_path: Path) -> None:
     directories = CellDirectories("cell", tmp_path, tmp_path)
     directories.taught.write_bytes(b"\xff")
-    finding = command._taught(cast(RunPlan, None), directories)
+    finding = cell_module._taught(cast(RunPlan, None), directories)
     assert finding.ok is False
     assert "taught.json" in finding.message
     assert directories.taught.read_bytes() == b"\xff"  # who looks renames nothing

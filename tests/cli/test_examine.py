@@ -100,7 +100,7 @@ def test_a_folder_of_tables_is_judged(tmp_path: Path, capsys: pytest.CaptureFixt
         ),
         (
             lambda folder: (folder / "markers.csv").write_text("camera,t,marker,u,v\nleft,0,1,2\n"),
-            "line 2: 5 cells are needed",
+            "line 2: 'left,0,1,2': 4 cells, 5 are needed",
         ),
         (
             lambda folder: (folder / "cameras.csv").write_text("camera,width,height\nleft,0,480\n"),
@@ -179,3 +179,22 @@ def test_real_pictures_of_an_arm_whose_poses_are_known(
     (cause,) = report["causes"]
     assert (cause["kind"], cause["subject"], cause["onset"]["frame"]) == ("camera_moved", "cam2", moved_from)
     assert cause["effect_px"] == pytest.approx(5.0, abs=0.6)
+
+
+def test_tables_that_a_spreadsheet_saved_are_those_that_were_meant(tmp_path: Path) -> None:
+    """Semicolons, decimal commas, blank lines, code page 1252, and a last line that is cut."""
+    plain, odd = tmp_path / "plain", tmp_path / "odd"
+    for folder in (plain, odd):
+        folder.mkdir()
+        (folder / "cameras.csv").write_text("camera,width,height\nleft,640,480\n")
+    joints = "t,höhe[deg]\n0.5,1.25\n1.5,-2\n2.5,3e-1\n"
+    markers = "camera,t,marker,u,v\nleft,0.5,1,2.5,3\nleft,1.5,1,2.75,3\n"
+    (plain / "joints.csv").write_text(joints)
+    (plain / "markers.csv").write_text(markers)
+    in_german = (text.replace(",", ";").replace(".", ",").replace("\n", "\r\n\r\n") for text in (joints, markers))
+    for name, text in zip(("joints.csv", "markers.csv"), in_german, strict=True):
+        (odd / name).write_bytes(f"{text}left;2".encode("cp1252") if name == "markers.csv" else text.encode("cp1252"))
+    meant, read = read_folder(plain), read_folder(odd)
+    assert read.joint_names == meant.joint_names == ("höhe",)
+    for name in ("joint_times", "positions", "times", "pixels"):
+        assert np.array_equal(getattr(read, name), getattr(meant, name))

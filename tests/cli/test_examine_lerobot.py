@@ -27,6 +27,7 @@ from lerobot_sets import (
     write,
     write_by_lerobot,
     write_in_av1,
+    write_video,
 )
 from stereoservo.cli.examine import read_data_set
 from stereoservo.cli.main import invoke
@@ -200,21 +201,6 @@ def test_pictures_in_lerobots_own_codec_are_read(tmp_path: Path) -> None:
         (["--units", UNITS], lambda f: rewritten(f, video_path="{where}.mp4"), "its parts may be video_key, episode_"),
         (["--units", UNITS], lambda f: rewritten(f, features={}), "no feature 'observation.state'"),
         (["--units", UNITS], lambda f: (f / "meta/info.json").write_text("{"), "info.json"),
-        (
-            ["--units", UNITS],
-            lambda f: (f / "data/chunk-000/episode_000001.parquet").write_bytes(b"no table"),
-            "episode_000001.parquet",
-        ),
-        (
-            ["--units", UNITS],
-            lambda f: (f / "videos/chunk-000/observation.images.up/episode_000001.mp4").unlink(),
-            "no such video",
-        ),
-        (
-            ["--units", UNITS],
-            lambda f: (f / "videos/chunk-000/observation.images.up/episode_000000.mp4").write_bytes(b"no video"),
-            "episode_000000.mp4: [Errno 1094995529] Invalid data found when processing input",
-        ),
     ],
 )  # fmt: skip
 def test_what_cannot_be_read_is_refused_with_what_would_be_right(
@@ -241,7 +227,7 @@ UP = "observation.images.up"
     ("kind", "damage", "named"),
     [
         ("video", lambda f: (f / "meta/info.json").write_text('{"features":' + "[" * 100_000), "info.json"),
-        ("video", lambda f: (f / "meta/info.json").write_bytes(b'{"codebase_version":"\xff"}'), "not UTF-8"),
+        ("video", lambda f: (f / "meta/info.json").write_bytes(b'{"codebase_version":"\xff"}'), "required field"),
         ("video", lambda f: rewritten(f, video_path="{video_key.x}"), "its parts may be video_key"),
         ("video", lambda f: rewritten(f, video_path="{chunk_index[0]}"), "its parts may be video_key"),
         ("video", lambda f: rewritten(f, video_path="a" * 5000), "no such video"),
@@ -253,9 +239,7 @@ UP = "observation.images.up"
         ("video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/chunk_index", [None, 0]), "episode 0"),
         ("video", lambda f: changed(f, "meta/episodes", f"videos/{UP}/from_timestamp", [0.0, np.nan]), "episode 1"),
         ("video", lambda f: changed(f, "meta/episodes", "episode_index", [0, None]), "episode None"),
-        ("image", lambda f: changed(f, "data", UP, ["up.png"] * 7), "at frame 0 of episode 0"),
         ("image", lambda f: changed(f, "data", "frame_index", [[k % 4] for k in range(7)]), "file-000.parquet"),
-        ("image", lambda f: changed(f, "data", UP, [{"bytes": "up.png"}] * 7), "at frame 0 of episode 0"),
     ],
 )  # fmt: skip
 def test_tables_that_lie_are_refused_by_name(kind: str, damage: Any, named: str, tmp_path: Path) -> None:
@@ -263,6 +247,54 @@ def test_tables_that_lie_are_refused_by_name(kind: str, damage: Any, named: str,
     damage(folder)
     with pytest.raises(CommandError, match=re.escape(named)):
         read_data_set(folder, UNITS)
+
+
+def cut(path: Path, share: float) -> None:
+    path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+
+
+VIDEO_UP = "videos/chunk-000/observation.images.up/episode_000000.mp4"
+
+
+@pytest.mark.parametrize(
+    ("version", "kind", "damage", "frames", "noted"),
+    [
+        ("v2.1", "video", lambda f: write_video(f / VIDEO_UP, short()[0].pictures[0, :3]), (6, 7),
+         "lost: episode 0, frame 3, camera up: .*no picture at 0.300 s"),
+        ("v2.1", "video", lambda f: (f / VIDEO_UP).unlink(), (3, 7),
+         "lost: episode 0, frames 0 to 3, camera up: .*no such video"),
+        ("v2.0", "video", lambda f: (f / VIDEO_UP).write_bytes(b"no video"), (3, 7),
+         "lost: episode 0, frames 0 to 3, camera up: .*Invalid data found"),
+        ("v2.1", "video", lambda f: cut(f / VIDEO_UP, 0.5), (3, 7), "lost: episode 0, frames 0 to 3, camera up: "),
+        ("v2.1", "video", lambda f: cut(f / "data/chunk-000/episode_000001.parquet", 0.7), (4, 4),
+         "episode_000001.parquet: .*no rows of 1 of 2 episodes: 1"),
+        ("v2.1", "image", lambda f: (f / "data/chunk-000/episode_000000.parquet").unlink(), (3, 3),
+         "no rows of 1 of 2 episodes: 0"),
+        ("v3.0", "video", lambda f: changed(f, "meta/episodes", "episode_index", [5, 1]), (3, 3),
+         "lost: episode 0, frames 0 to 3, camera up: .*meta/episodes has no episode 0"),
+        ("v3.0", "image", lambda f: changed(f, "data", UP, [{"bytes": b""}, *6 * [None]]), (0, 7),
+         "lost: episode 0, frames 0 to 3, camera up: .*no picture that OpenCV reads at frame 0"),
+        ("v3.0", "image", lambda f: changed(f, "data", "timestamp", [0.0, np.nan, 0.2, 0.3, 0.0, 0.1, 0.2]), (6, 6),
+         "1 of 7 rows cannot be used, the first one row 1"),
+    ],
+)  # fmt: skip
+def test_what_is_lost_is_noted_and_the_rest_is_read(
+    version: str, kind: str, damage: Any, frames: tuple[int, int], noted: str, tmp_path: Path
+) -> None:
+    folder = write(tmp_path / "set", version, short(), kind)
+    damage(folder)
+    views = read_data_set(folder, UNITS)
+    by_name = {camera.name: int((views.camera == c).sum()) for c, camera in enumerate(views.cameras)}
+    assert (by_name.get("up", 0), by_name["side"]) == frames
+    assert re.search(noted, " ".join(views.notes))
+
+
+def test_what_is_lost_is_told_where_nothing_can_be_learnt(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write(tmp_path / "set", "v2.1", short())
+    write_video(folder / VIDEO_UP, short()[0].pictures[0, :3])
+    code, answer = told(capsys, str(folder), "--units", UNITS)
+    assert (code, answer["error"]["code"]) == (1, "too_few_stops")
+    assert answer["error"]["notes"][0].startswith("lost: episode 0, frame 3, camera up: ")
 
 
 def test_a_camera_that_sees_no_marker_is_left_out(tmp_path: Path) -> None:

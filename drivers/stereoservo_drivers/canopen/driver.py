@@ -70,6 +70,13 @@ class CanJointDriver:
         self._reported_fault: MasterFault | None = None
         self._write_seq = 0
 
+    @staticmethod
+    def examine_file(path: Path) -> Iterator[ExaminationFinding]:
+        """Findings on an EDS or DCF file. Raises DriverError (``eds``)."""
+        from stereoservo_drivers.canopen.examination import examine_eds  # not for the servo process
+
+        return examine_eds(path)
+
     def describe(self) -> JointDriverDescription:
         """Description by the cell file's joints and limits; the servo's clock sets the pace."""
         return JointDriverDescription(

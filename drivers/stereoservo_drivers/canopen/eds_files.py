@@ -6,15 +6,15 @@ The package ``canopen`` gets a clean text of the objects that were taken: it ref
 
 from __future__ import annotations
 
-import codecs
 import io
 import re
 from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
+from stereoservo.messages.text_files import Remark, decoded_text
 from stereoservo.ports.devices import DriverError
 
 if TYPE_CHECKING:
@@ -26,19 +26,7 @@ MOST_REMARKS = 200
 """Remarks that are listed of one file, the first ones."""
 
 
-class EdsRemark(NamedTuple):
-    """What is odd in a line: its number (from 1; 0: the whole file), the text there, and what was assumed."""
-
-    line: int
-    value: str
-    assumed: str
-
-    def __str__(self) -> str:
-        where = f"line {self.line}: " if self.line else ""
-        return f"{where}{self.value!r}: {self.assumed}" if self.value else f"{where}{self.assumed}"
-
-
-def read_eds(path: Path, node_id: int | None = None) -> tuple[canopen.ObjectDictionary, list[EdsRemark]]:
+def read_eds(path: Path, node_id: int | None = None) -> tuple[canopen.ObjectDictionary, list[Remark]]:
     """Object dictionary of an EDS or DCF file, and what is odd in the file, by line. ``node_id``: for values relative
     to it; None: the file's own, if it has one.
 
@@ -68,7 +56,7 @@ def read_eds(path: Path, node_id: int | None = None) -> tuple[canopen.ObjectDict
     return import_od(source, node_id), remarks
 
 
-def clean_eds(raw: bytes) -> tuple[str, list[EdsRemark]]:
+def clean_eds(raw: bytes) -> tuple[str, list[Remark]]:
     """Text of the usable objects of a file's bytes, as strict readers take it (empty: there are none), and what is odd,
     by line.
     """
@@ -106,7 +94,6 @@ _KEYS = {key.lower(): key for key in (*_OTHERS, *_VALUES, *_BESIDE, *_DEVICE_TEX
 """Keys that are read, as strict readers spell them."""
 _LISTS = ("mandatoryobjects", "optionalobjects", "manufacturerobjects")
 
-_LINE_END = re.compile(r"\r\n|\r|\n")
 _COMMENT = re.compile(r"^\s*[;#].*|\s;.*")
 _HEADER = re.compile(r"\[([^\]]*)(\]?)(.*)")
 _OBJECT = re.compile(r"(?:0x)?([0-9a-f]{4})(?:sub(?:0x)?0*([0-9a-f]{1,2})|(name))?")
@@ -148,36 +135,18 @@ class _EdsReader:
     """Reads one file; ``remarks`` collects what is odd."""
 
     def __init__(self, raw: bytes) -> None:
-        self.remarks: list[EdsRemark] = []
-        self._sections = self._split(self._decoded(raw))
+        text, self.remarks = decoded_text(raw)
+        self._sections = self._split(text)
         self._named = {section.name: section for section in reversed(self._sections)}
 
     def _odd(self, line: int, value: str, assumed: str) -> None:
         if len(self.remarks) < MOST_REMARKS:
-            self.remarks.append(EdsRemark(line, value[:60], assumed))
-
-    def _decoded(self, raw: bytes) -> str:
-        """Text of the bytes: by its byte order mark or zeros UTF-16, else UTF-8, else code page 1252."""
-        zeros = [raw[k:2000:2].count(0) * 5 > len(raw[:2000]) for k in (0, 1)]
-        if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or any(zeros) != all(zeros):
-            encoding = "utf-16-le" if raw.startswith(codecs.BOM_UTF16_LE) or zeros[1] else "utf-16-be"
-            self._odd(1, "", f"the file is in {encoding.upper()}")
-            text = raw.decode(encoding, "replace")
-        else:
-            try:
-                text = raw.decode()
-            except UnicodeDecodeError as error:
-                line = len(re.findall(rb"\r\n|\r|\n", raw[: error.start])) + 1
-                self._odd(line, "", f"byte 0x{raw[error.start]:02x} is not UTF-8: the file is read in code page 1252")
-                text = raw.removeprefix(codecs.BOM_UTF8).decode("cp1252", "replace")
-        if "\0" in text:
-            self._odd(0, "", f"{text.count(chr(0))} zero bytes, as a crash leaves them: left out")
-        return text.replace("\0", "").replace("\ufeff", "")
+            self.remarks.append(Remark(line, value[:60], assumed))
 
     def _split(self, text: str) -> list[_Section]:
         """Sections of the text in order; of a key that occurs twice the first value."""
         found = [_Section("", 0)]
-        for number, raw in enumerate(_LINE_END.split(text), 1):
+        for number, raw in enumerate(text.split("\n"), 1):
             line = _COMMENT.sub("", raw).strip()
             if line.endswith("]") and "=" not in line and not line.startswith("["):
                 self._odd(number, line, "a header without '[': taken as one")

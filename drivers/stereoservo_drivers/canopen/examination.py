@@ -37,6 +37,9 @@ MISSED_SHARE = 0.01
 LATE_SHARE = 0.5
 HEARTBEAT_SHARE = 0.6
 SHOWN_LINES = 20
+PDOS = {"RPDOs": 0x1400, "TPDOs": 0x1800}
+"""First of the 512 objects that may each describe one."""
+CIA402 = {0x6040: "control word", 0x6041: "status word", 0x6060: "mode of operation"}
 
 
 class ExaminedDriver(JointDriver, Protocol):
@@ -80,6 +83,24 @@ def load_finding(options: CanOptions) -> ExaminationFinding:
         f"{load.share:.0%} in the worst case of bit stuffing, limit {options.max_bus_load:.0%} (max_bus_load); "
         f"{len(options.joint)} joints at {options.rate_hz:g} Hz; this bus carries {load.max_rate_hz:.0f} Hz",
     )
+
+
+def examine_eds(path: Path) -> Iterator[ExaminationFinding]:
+    """Findings on an EDS or DCF file: the drive, its objects, what is odd. Raises DriverError (``eds``)."""
+    dictionary = read_eds(path)[0]
+    of = dictionary.device_information
+    names = [str(name) for name in (of.vendor_name, of.product_name) if name]
+    vendor, product = (
+        f"0x{number:x}" if number is not None else "none" for number in (of.vendor_number, of.product_number)
+    )
+    yield ExaminationFinding("drive", True, f"{' '.join(names) or 'unnamed'}: vendor {vendor}, product {product}")
+    pdos = {what: sum(first <= index < first + 0x200 for index in dictionary) for what, first in PDOS.items()}
+    counts = ", ".join(f"{count} {what}" for what, count in pdos.items())
+    yield ExaminationFinding("objects", True, f"{len(dictionary)} objects, {counts}")
+    if lacking := [f"0x{index:04X} ({what})" for index, what in CIA402.items() if index not in dictionary]:
+        message = f"without {', '.join(lacking)}, which CiA 402 drives have"
+        yield ExaminationFinding("CiA 402", None, message, "the drive is asked; is this the file of the drive itself?")
+    yield from eds_findings(path)
 
 
 def eds_findings(path: Path) -> Iterator[ExaminationFinding]:

@@ -23,6 +23,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.messages.decoding import decoding
+from stereoservo.messages.text_files import complete, json_of
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.can.frames import CanFrame
@@ -361,7 +362,7 @@ class Release(msgspec.Struct, frozen=True):
 def load_release(path: Path) -> Release:
     """Read a ``flat_endpoints.json``. Raises DriverError (``endpoints``)."""
     with decoding(lambda cause: DriverError("endpoints", f"endpoints: {path} {cause}", path=str(path))):
-        release = msgspec.json.decode(path.read_bytes(), type=Release)
+        release = msgspec.convert(complete(json_of(path.read_bytes())), Release)
     unfit = [name for name in CHECKED if _layout(release, name) is None]
     if unfit:
         raise DriverError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +11,7 @@ import msgspec
 from msgspec import Meta
 
 from stereoservo.messages.goals import AuxiliarySpec
+from stereoservo.messages.text_files import complete, toml_of
 from stereoservo.ports.devices import DriverError, JointSpec
 from stereoservo_drivers.options import decode_options
 from stereoservo_drivers.position_output import LEAD_S, LOAD_OFFSET
@@ -199,8 +199,8 @@ def _with_profile(gripper: Any, cell_dir: Path) -> Any:
         return gripper
     path = cell_dir / name
     try:
-        profile = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        profile = complete(toml_of(path.read_bytes()))
+    except (OSError, ValueError) as error:
         raise DriverError(
             "option",
             f"driver 'canopen': gripper {gripper.get('name', '')!r}: profile = {name!r}: {error}; a TOML file beside "

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import math
-import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
@@ -20,12 +18,13 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.examination.examination import RecordingReport, examine_views
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
-from stereoservo.calibration.trial_data import TrialCamera
-from stereoservo.cli.output import CommandError, JsonOption, emit, log
+from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
+from stereoservo.cli.output import CommandError, JsonOption, emit, log, read_columns
 from stereoservo.core.state_encoding import StateVersionError, decode_state
 from stereoservo.kinematics.model import CellModel
 from stereoservo.kinematics.parameterization import Kind
 from stereoservo.messages.decoding import cause_of
+from stereoservo.messages.text_files import complete, toml_of
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import lerobot, plugins
 from stereoservo.ports.clock import MonotonicClock
@@ -70,7 +69,10 @@ def examine(
         views = read_flight(dataset)
     else:
         raise CommandError("dataset", f"{dataset} is no flight recording (*.mcap), folder or LeRobot data set")
-    report = examine_views(views)
+    try:
+        report = examine_views(views)
+    except CalibrationError as error:
+        raise CommandError(error.code, "; ".join((str(error), *views.notes)), notes=views.notes) from error
     emit(report, _text(report), json)
 
 
@@ -222,7 +224,8 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
     names, kinds, scales, columns = lerobot.joints_of(lerobot.state_names(info, folder), units)
     wanted = None if cameras is None else [name.strip() for name in cameras.split(",")]
     keys = lerobot.camera_features(info, folder, wanted)
-    rows = lerobot.read_rows(folder, info)
+    losses: list[lerobot.Loss] = []
+    rows = lerobot.read_rows(folder, info, losses=losses)
     stamps, joint_times, states = _one_clock(rows)
     every = max(1, -(-len(rows.stamp) * len(keys) // MOST_FRAMES))
     if every > 1:
@@ -233,8 +236,12 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
         least = COMPRESSED_PX if info.features[key].dtype == "video" else 0.0
         seen: dict[float, tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
         size = None
-        for row, decoded in lerobot.pictures(folder, info, key, rows, every, gray=True):
-            image = decoded()
+        for row, decoded in lerobot.pictures(folder, info, key, rows, every, gray=True, losses=losses):
+            try:
+                image = decoded()
+            except lerobot.DataSetError as error:
+                losses.append(lerobot.Loss(str(error), name, int(rows.episode[row]), int(rows.frame[row])))
+                continue
             size, before = (image.shape[1], image.shape[0]), size
             if before not in (None, size):
                 raise CommandError("dataset", f"LeRobot data set {folder}: {key}: a picture of {size} after {before}")
@@ -253,8 +260,9 @@ def _views(folder: Path, units: str | None, cameras: str | None, detector: Path 
         raise CommandError(
             "dataset",
             f"LeRobot data set {folder}: no camera shows a marker that the detector looks for; its cameras are "
-            f"{', '.join(keys) or 'none'}",
+            f"{', '.join(keys) or 'none'}" + "".join(f"; {text}" for text in lerobot.described_losses(losses)),
         )
+    notes += lerobot.described_losses(losses)
     counted = bool(np.abs(rows.stamp - rows.frame / info.fps).max() < COUNTED_S)
     if counted:
         log("stamps are the count of frames over the rate: dropped frames cannot be told")
@@ -301,7 +309,8 @@ LARGEST = 10**9
 UNIT = 1e-2
 """Largest deviation of a quaternion's norm from 1."""
 
-Rows = list[dict[str, str]]
+Rows = list[tuple[int, dict[str, str]]]
+"""Rows of a table, each with its line."""
 
 
 def read_folder(folder: Path) -> RecordedViews:
@@ -316,7 +325,7 @@ def read_folder(folder: Path) -> RecordedViews:
         )
     motion = _table(folder / given[0])
     key = _time_column(folder / given[0], motion)
-    stamps = np.array([_number(folder / given[0], k, row, key) for k, row in enumerate(motion, 2)])
+    stamps = np.array([_number(folder / given[0], line, row, key) for line, row in motion])
     order = np.argsort(stamps, kind="stable")
     names, kinds, positions, generators = (
         _joints(folder / JOINTS, motion, key, order) if given[0] == JOINTS else _poses(folder / POSES, motion, order)
@@ -378,7 +387,7 @@ def gathered_views(
 def _joints(
     path: Path, rows: Rows, key: str, order: np.ndarray[Any, Any]
 ) -> tuple[tuple[str, ...], tuple[Kind, ...], FloatArray, None]:
-    columns = [name for name in rows[0] if name not in (key, "episode")]
+    columns = [name for name in rows[0][1] if name not in (key, "episode")]
     names, kinds, scales = [], [], []
     for column in columns:
         name, _, unit = column.partition("[")
@@ -390,22 +399,22 @@ def _joints(
         scales.append(UNITS[unit][1])
     if not names:
         raise CommandError("dataset", f"{path} has no column of a joint beside {key!r}")
-    values = np.array([[_number(path, k, row, column) for column in columns] for k, row in enumerate(rows, 2)])
+    values = np.array([[_number(path, line, row, column) for column in columns] for line, row in rows])
     return tuple(names), tuple(kinds), values[order] * np.array(scales), None
 
 
 def _poses(
     path: Path, rows: Rows, order: np.ndarray[Any, Any]
 ) -> tuple[tuple[str, ...], tuple[Kind, ...], FloatArray, FloatArray]:
-    lacking = [name for name in POSE_COLUMNS if name not in rows[0]]
+    lacking = [name for name in POSE_COLUMNS if name not in rows[0][1]]
     if lacking:
         raise CommandError("dataset", f"{path} lacks columns {', '.join(lacking)}; {','.join(POSE_COLUMNS)} are needed")
-    values = np.array([[_number(path, k, row, name) for name in POSE_COLUMNS] for k, row in enumerate(rows, 2)])
+    values = np.array([[_number(path, line, row, name) for name in POSE_COLUMNS] for line, row in rows])
     lengths = np.linalg.norm(values[:, 3:], axis=1)
     wrong = np.flatnonzero(np.abs(lengths - 1.0) > UNIT)
     if len(wrong):
         k = int(wrong[0])
-        raise _wrong(path, k + 2, "qx..qw", f"length {lengths[k]:.4g}", "a unit quaternion, xyzw")
+        raise _wrong(path, rows[k][0], "qx..qw", f"length {lengths[k]:.4g}", "a unit quaternion, xyzw")
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
     poses[:, :3, 3] = values[:, :3]
@@ -420,12 +429,12 @@ def _poses(
 def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     path, listed = folder / MARKERS, folder / CAMERAS
     sizes = {
-        row["camera"]: (_whole(listed, k, row, "width", 1), _whole(listed, k, row, "height", 1))
-        for k, row in enumerate(_table(listed, ("camera", "width", "height")), 2)
+        row["camera"]: (_whole(listed, line, row, "width", 1), _whole(listed, line, row, "height", 1))
+        for line, row in _table(listed, ("camera", "width", "height"))
     }
     _require(path, rows, ("camera", "marker", "u", "v"))
     frames = GatheredFrames(sizes)
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
         seen = frames.of(path, line, row, key)
         if not row["marker"]:
             continue  # a frame without detections
@@ -439,11 +448,11 @@ def _marker_frames(folder: Path, rows: Rows, key: str) -> GatheredFrames:
 def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
     path = folder / FRAMES
     _require(path, rows, ("camera", "file"))
-    cameras = list(dict.fromkeys(row["camera"] for row in rows))
+    cameras = list(dict.fromkeys(row["camera"] for _, row in rows))
     detectors = {camera: stated_detector(folder / DETECTOR, camera) for camera in cameras}
     frames = GatheredFrames({})
     found = dict.fromkeys(cameras, 0)
-    for line, row in enumerate(rows, 2):
+    for line, row in rows:
         image = cv2.imread(str(folder / row["file"]), cv2.IMREAD_GRAYSCALE)
         if image is None:
             raise _wrong(path, line, "file", row["file"], "a picture in the folder that OpenCV reads")
@@ -454,7 +463,9 @@ def _pictures(folder: Path, rows: Rows, key: str) -> GatheredFrames:
         seen.update(detected(detectors[camera], camera, line, image))
         found[camera] += bool(seen)
     for camera in cameras:
-        log(f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for row in rows)} pictures")
+        log(
+            f"camera {camera}: markers in {found[camera]} of {sum(row['camera'] == camera for _, row in rows)} pictures"
+        )
     return frames
 
 
@@ -473,8 +484,8 @@ def detected(
 def stated_detector(path: Path, camera: str) -> Detector:
     """The detector of a camera, named in a file. Raises CommandError."""
     try:
-        stated = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        stated = complete(toml_of(path.read_bytes()))
+    except (OSError, ValueError) as error:
         raise CommandError(
             "dataset",
             f'{path}: {error}; with pictures, it names their detector: detector = "aruco", [options] tags = [9]',
@@ -493,31 +504,17 @@ def stated_detector(path: Path, camera: str) -> Detector:
 
 
 def _table(path: Path, needed: tuple[str, ...] = ()) -> Rows:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            rows: Rows = [dict(row) for row in csv.DictReader(file, skipinitialspace=True)]
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise CommandError("dataset", f"{path} cannot be read: {error}") from error
-    if not rows:
-        raise CommandError("dataset", f"{path} holds no row below its header")
-    names = [name for name in rows[0] if name is not None]
-    for line, row in enumerate(rows, 2):
-        if None in row or None in row.values():
-            raise CommandError("dataset", f"{path}, line {line}: {len(names)} cells are needed", line=line)
-    _require(path, rows, needed)
-    return rows
+    return read_columns(path, needed, "dataset")
 
 
 def _require(path: Path, rows: Rows, needed: tuple[str, ...]) -> None:
-    lacking = [name for name in needed if name not in rows[0]]
+    lacking = [name for name in needed if name not in rows[0][1]]
     if lacking:
-        raise CommandError(
-            "dataset", f"{path} lacks columns {', '.join(lacking)}; it has {', '.join(map(str, rows[0]))}"
-        )
+        raise CommandError("dataset", f"{path} lacks columns {', '.join(lacking)}; it has {', '.join(rows[0][1])}")
 
 
 def _time_column(path: Path, rows: Rows) -> str:
-    found = [name for name in (TIME, ORDER) if name in rows[0]]
+    found = [name for name in (TIME, ORDER) if name in rows[0][1]]
     if len(found) != 1:
         raise CommandError(
             "dataset", f"{path} needs one of the columns {TIME!r} [s] and {ORDER!r}; it has {found or 'neither'}"

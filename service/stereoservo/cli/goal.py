@@ -30,9 +30,9 @@ from stereoservo.cli.output import (
     marker_ids,
     pairs,
     read_file,
+    read_object,
 )
 from stereoservo.client import Client, ClientError, GoalHandle
-from stereoservo.messages.decoding import decoding
 from stereoservo.messages.discovery import find_daemon
 from stereoservo.messages.goals import Approach, FeatureTarget, Goal, PlanReport, PointTarget, StreamedTarget
 from stereoservo.messages.wire import MessageError, decode, encode
@@ -93,11 +93,11 @@ def target_tree(
     if joints:
         return {"kind": "joints", "positions": pairs(joints, "--joint")}
     if set_points is not None:
-        return {"kind": "features", "set_points": _object(set_points)}
+        return {"kind": "features", "set_points": read_object(set_points)}
     kind, path = next((kind, path) for kind, path in files.items() if path is not None)
     if kind == "points" and str(path) in SOURCES:
         raise CommandError("usage", f"--points takes a file; {path} goes with --point-source")
-    tree = _object(path)
+    tree = read_object(path)
     if tree.get("kind", KINDS[kind]) != KINDS[kind]:
         raise CommandError("file", f"{path}: kind is {tree['kind']!r}; {KINDS[kind]!r} goes with --{kind}")
     matrix = tree.get("matrix")
@@ -118,15 +118,6 @@ def _id_groups(text: str, what: str, least: int, most: int) -> list[list[int]]:
         )
         raise CommandError("argument", f"{what} {text!r}: groups of {count} ids are valid, {example} say")
     return groups
-
-
-def _object(path: Path) -> dict[str, Any]:
-    data = read_file(path)
-    with decoding(lambda cause: CommandError("file", f"{path}: is not JSON: {cause}")):
-        found = msgspec.json.decode(data)
-    if not isinstance(found, dict):
-        raise CommandError("file", f"{path}: holds {type(found).__name__}; a JSON object is needed")
-    return found
 
 
 def adaptive(text: str) -> dict[str, float]:
@@ -399,7 +390,9 @@ def goal(cell: CellArgument, given: GoalOptions = GOAL_OPTIONS, options: CellOpt
         target = target_tree(given.name, given.joint, given.set_points, files, *relative)
     local = target if given.file is None and stream is None and options.endpoint is None else {}
     ends_in = None if given.posture is None else _ends_in(cell, local, given.posture, options.operator)
-    requested = _requested(given, target, ends_in) if given.file is None else decode(read_file(given.file), Goal)
+    requested = (
+        _requested(given, target, ends_in) if given.file is None else decode(encode(read_object(given.file)), Goal)
+    )
     with options.client(cell, interruption.check) as client:
         require_cameras(client, found)
         if given.check or requested.check:

@@ -18,6 +18,7 @@ from stereoservo.messages.addresses import Address
 from stereoservo.messages.cell_file import CameraSection, check_joints, load_cell_file
 from stereoservo.messages.directories import CELL_NAME
 from stereoservo.messages.goals import DEFAULT_LAW
+from stereoservo.messages.text_files import decoded_text
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import CameraDescription, DriverContext, DriverError, JointDriverDescription
@@ -97,7 +98,7 @@ def _copy(source: str, file: Path, cell: str, contradicted: object) -> None:
         )
     path = shipped_or_path(source)
     load_cell_file(path)
-    text = path.read_text(encoding="utf-8")
+    text, _ = decoded_text(path.read_bytes())
     renamed, count = re.subn(r'(?m)^(\[cell\]\s*\n(?:[^\[\n]*\n)*?name\s*=\s*)"[^"]*"', rf'\g<1>"{cell}"', text)
     if count != 1:
         raise CommandError("file", f'{path}: no line name = "…" under [cell], which is changed in a copy')

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, TextIO
 import msgspec
 import typer
 
+from stereoservo.messages.text_files import complete, json_of, table_of
+
 if TYPE_CHECKING:
     from stereoservo.client import Client
 
@@ -175,6 +177,38 @@ def read_file(path: Path) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise CommandError("file", f"{path}: {error.strerror}") from error
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Content of a JSON file; what is odd in it is logged. Raises CommandError."""
+    try:
+        tree, odd = json_of(read_file(path))
+        complete((tree, odd))
+    except ValueError as error:
+        raise CommandError("file", f"{path}: is not JSON: {error}") from error
+    for remark in odd:
+        log(f"{path}: {remark}")
+    if not isinstance(tree, dict):
+        raise CommandError("file", f"{path}: holds {type(tree).__name__}; a JSON object is needed")
+    return tree
+
+
+def read_columns(path: Path, columns: tuple[str, ...], code: str) -> list[tuple[int, dict[str, str]]]:
+    """Rows of a table with their lines, at least one; what is odd in it is logged.
+
+    Raises CommandError (``code``), also if ``columns`` are missing.
+    """
+    try:
+        table = table_of(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise CommandError(code, f"{path} cannot be read: {error}") from error
+    for remark in table.remarks:
+        log(f"{path}: {remark}")
+    if missing := [name for name in columns if name not in table.columns]:
+        raise CommandError(code, f"{path} lacks columns {', '.join(missing)}; it has {', '.join(table.columns)}")
+    if not table.rows:
+        raise CommandError(code, "; ".join((f"{path} holds no row below its header", *map(str, table.remarks[:3]))))
+    return table.rows
 
 
 def shipped_or_path(cell: str) -> Path:

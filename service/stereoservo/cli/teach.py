@@ -5,13 +5,11 @@ goal.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import msgspec
 import typer
 
-from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, marker_ids, read_file
-from stereoservo.messages.decoding import decoding
+from stereoservo.cli.output import CELL_OPTIONS, CellArgument, CellOptions, CommandError, marker_ids, read_object
 from stereoservo.messages.wire import Synthesise, decode, encode
 
 
@@ -55,11 +53,7 @@ def teach(
 
 def read_drawing(path: Path, name: str) -> Synthesise:
     """Parse a drawing's file as a request; ``pose`` may be nested rows. Raises CommandError, MessageError."""
-    data = read_file(path)
-    with decoding(lambda cause: CommandError("file", f"{path}: is not JSON: {cause}")):
-        tree: Any = msgspec.json.decode(data)
-    if not isinstance(tree, dict):
-        raise CommandError("file", f"{path}: holds {type(tree).__name__}; a JSON object is needed")
+    tree = read_object(path)
     pose = tree.get("pose")
     if isinstance(pose, list) and all(isinstance(row, list) for row in pose):
         tree["pose"] = [number for row in pose for number in row]

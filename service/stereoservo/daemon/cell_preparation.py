@@ -22,6 +22,7 @@ from stereoservo.daemon.ipc_messages import PlanOptions, RunPlan, save_plan
 from stereoservo.daemon.kernel_compilation import collect_seldom, report_progress, warm_up_first
 from stereoservo.daemon.process_control import die_with_parent
 from stereoservo.messages.cell_file import CellFile, CellFileError, load_cell_file
+from stereoservo.messages.text_files import Remark
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import (
@@ -88,8 +89,10 @@ def describe_cell(
 
 def make_plan(cell_path: Path, runtime: Path, state: Path, options: PlanOptions) -> RunPlan:
     """The run plan of a cell, checked with its drivers. Raises CellFileError, PluginError, DriverError."""
-    cell = load_cell_file(cell_path)
+    odd: list[Remark] = []
+    cell = load_cell_file(cell_path, odd)
     joints, cameras = describe_cell(cell, cell_path, runtime, MonotonicClock(), seed=options.seed)
+    joints = msgspec.structs.replace(joints, notes=(*joints.notes, *(f"{cell_path.name}: {remark}" for remark in odd)))
     plan = RunPlan(
         cell=cell, cell_path=str(cell_path), runtime=str(runtime), state=str(state), boot=options.boot,
         joints=joints, cameras=cameras, seed=options.seed, dry_run=options.dry_run,

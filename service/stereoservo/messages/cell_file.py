@@ -5,7 +5,6 @@ calibration, zenoh), strictly decoded and validated.
 from __future__ import annotations
 
 import math
-import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -16,6 +15,7 @@ from msgspec import Meta
 from stereoservo.messages.addresses import keep_secret, redacted, without_secrets
 from stereoservo.messages.goals import DEFAULT_LAW, LawName, Name, PointSource
 from stereoservo.messages.known_length import known_length_of
+from stereoservo.messages.text_files import Remark, complete, toml_of
 
 SCHEMA = 1
 Mount = Literal["eye_to_hand", "eye_in_hand"]
@@ -254,18 +254,19 @@ class CellFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return drives if isinstance(drives, dict) else self.joints.options
 
 
-def load_cell_file(path: Path) -> CellFile:
-    """Read and check a cell file. Raises CellFileError with file, key, value and valid values."""
+def load_cell_file(path: Path, remarks: list[Remark] | None = None) -> CellFile:
+    """Read and check a cell file; ``remarks`` receives what was repaired in its text. Raises CellFileError with file,
+    key, value and valid values, and with the lines that cannot be read.
+    """
     try:
-        text = path.read_bytes()
+        tree, odd = toml_of(path.read_bytes())
+        if remarks is not None:
+            remarks += odd
+        complete((tree, odd))  # a limit may be among what is missing
     except OSError as error:
         raise CellFileError(path, "", f"cannot be read: {error.strerror}") from error
-    try:
-        tree = tomllib.loads(text.decode())
-    except ValueError as error:  # of TOML, UTF-8, or numbers with thousands of digits
+    except ValueError as error:
         raise CellFileError(path, "", f"is not TOML: {error}") from error
-    except RecursionError as error:
-        raise CellFileError(path, "", "is nested too deeply; a cell file has three levels") from error
     return check_cell(tree, path)
 
 

@@ -183,10 +183,12 @@ def directories_of(cell: str) -> CellDirectories:
     """
     if not cell.endswith(".toml"):
         return cell_directories(cell)
-    import tomllib  # imported here, so that a stop by the cell's name need not wait for it
+    from stereoservo.messages.text_files import (
+        toml_of,  # imported here, so that a stop by the cell's name need not wait for it
+    )
 
     try:
-        name = tomllib.loads(Path(cell).read_text(encoding="utf-8"))["cell"]["name"]
+        name = toml_of(Path(cell).read_bytes())[0]["cell"]["name"]
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise DirectoryError(f"{cell}: the cell's name cannot be read: {error}") from error
     return cell_directories(str(name))

@@ -9,7 +9,7 @@ import math
 import os
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +19,7 @@ import msgspec
 import numpy as np
 
 from stereoservo.messages.decoding import decoding
+from stereoservo.messages.text_files import complete, json_of
 from stereoservo.numerics.arrays import FloatArray, ImageArray, IntArray
 from stereoservo.ports.devices import JointKindName
 
@@ -38,6 +39,7 @@ UNITS: dict[str, tuple[JointKindName, float]] = {
 MOST_COUNTED = 2**40
 """Largest number of a frame or an episode."""
 MOST_STATES = 4096
+MOST_EPISODES = 100_000
 LARGEST_STAMP_S = 1e6
 MOST_NAMED = 20
 """Largest number of episodes that an error message lists."""
@@ -55,12 +57,43 @@ Raises DataSetError.
 """
 
 
+Lose = Callable[[int, "DataSetError"], None]
+"""Function that is called with a row whose image is missing, and why; may raise that error."""
+
+
 class DataSetError(Exception):
     """A data set, or a request for its data, cannot be used. ``code``: ``dataset`` or ``units``."""
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
         self.code = code
+
+
+class Loss(NamedTuple):
+    """What of a data set cannot be read, and its ``cause``: a ``frame`` of a ``camera`` in an ``episode``, or, without
+    these, something else.
+    """
+
+    cause: str
+    camera: str = ""
+    episode: int = -1
+    frame: int = -1
+
+
+def described_losses(losses: Sequence[Loss]) -> list[str]:
+    """Texts on what is lost, frames of a camera that follow each other together; at most ``MOST_NAMED``."""
+    found = [loss.cause for loss in losses if not loss.camera]
+    runs: list[list[Loss]] = []
+    for loss in (loss for loss in losses if loss.camera):
+        if runs and runs[-1][-1][1:] == (loss.camera, loss.episode, loss.frame - 1):
+            runs[-1].append(loss)
+        else:
+            runs.append([loss])
+    for (first, *_), last in ((run, run[-1]) for run in runs):
+        which = f"frame {first.frame}" if first is last else f"frames {first.frame} to {last.frame}"
+        found.append(f"lost: episode {first.episode}, {which}, camera {first.camera}: {first.cause}")
+    more = [f"{len(found) - MOST_NAMED} more losses"] if len(found) > MOST_NAMED else []
+    return found[:MOST_NAMED] + more
 
 
 class Feature(msgspec.Struct):
@@ -82,6 +115,7 @@ class Info(msgspec.Struct):
     fps: float
     features: dict[str, Feature]
     chunks_size: int = 1000
+    total_episodes: int | None = None
     video_path: str | None = None
 
 
@@ -120,7 +154,7 @@ def read_info(folder: Path) -> Info:
     if not is_data_set(folder):
         raise _wrong(folder, f"there is no file {INFO}; a LeRobot data set has one")
     with _reading(path):
-        info = msgspec.json.decode(path.read_bytes(), type=Info)
+        info = msgspec.convert(complete(json_of(path.read_bytes())), Info)
     if info.codebase_version not in VERSIONS:
         raise _wrong(
             folder,
@@ -213,7 +247,7 @@ def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = Non
     keys = [
         key for key, feature in info.features.items() if feature.dtype in ("video", "image") and not _of_depth(feature)
     ]
-    short = ["image" if key == IMAGES[0] else key.removeprefix(IMAGES[1]).removeprefix(IMAGES[2]) for key in keys]
+    short = [_short(key) for key in keys]
     count = Counter([*short, *keys])
     found = {name if count[name] == 1 else key: key for name, key in zip(short, keys, strict=True)}
     if wanted is None:
@@ -227,6 +261,10 @@ def camera_features(info: Info, folder: Path, wanted: Sequence[str] | None = Non
     return chosen
 
 
+def _short(key: str) -> str:
+    return "image" if key == IMAGES[0] else key.removeprefix(IMAGES[1]).removeprefix(IMAGES[2])
+
+
 def _of_depth(feature: Feature) -> bool:
     info = {**(feature.video_info or {}), **(feature.info or {})}
     return bool(info.get("video.is_depth_map") or info.get("is_depth_map"))
@@ -235,28 +273,37 @@ def _of_depth(feature: Feature) -> bool:
 # -- tables ---------------------------------------------------------------------------------------------------
 
 
-def _tables(folder: Path, part: str, columns: list[str], episode: int | None = None) -> dict[Path, Mapping[str, Any]]:
+def _tables(
+    folder: Path, part: str, columns: list[str], episode: int | None = None, losses: list[Loss] | None = None
+) -> dict[Path, Mapping[str, Any]]:
     """Columns of all parquet files of a part of a data set, or only the rows of one ``episode``, as lists by name.
-    Raises DataSetError.
+    Raises DataSetError; with ``losses``, which receives the files that cannot be read, only if none can.
     """
     from pyarrow import compute  # of a separate extra: see missing_extra
 
     found, episodes = {}, set()
     for path in sorted((folder / part).glob("chunk-*/*.parquet")):
-        with _reading(path):
-            file = _table(folder, path, columns)
-            if episode is not None:
-                index = file.read(columns=["episode_index"])["episode_index"]
-                episodes |= {int(number) for number in index.unique().to_pylist() if number is not None}
-                mine = compute.equal(index, episode)
-                if compute.any(mine).as_py():
-                    found[path] = file.read(columns=columns).filter(mine).to_pydict()
-            elif file.metadata.num_rows:
-                found[path] = file.read(columns=columns).to_pydict()
+        try:
+            with _reading(path):
+                file = _table(folder, path, columns)
+                if episode is not None:
+                    index = file.read(columns=["episode_index"])["episode_index"]
+                    episodes |= {int(number) for number in index.unique().to_pylist() if number is not None}
+                    mine = compute.equal(index, episode)
+                    if compute.any(mine).as_py():
+                        found[path] = file.read(columns=columns).filter(mine).to_pydict()
+                elif file.metadata.num_rows:
+                    found[path] = file.read(columns=columns).to_pydict()
+        except DataSetError as error:
+            if losses is None:
+                raise
+            losses.append(Loss(str(error)))
     if not found and episodes:
         raise _wrong(folder, f"no episode {episode} in {part}; it has {_listed(sorted(episodes))}")
     if not found:
-        raise _wrong(folder, f"no {part}/chunk-*/*.parquet with rows")
+        raise _wrong(
+            folder, f"no {part}/chunk-*/*.parquet with rows" + "".join(f"; {loss.cause}" for loss in losses or [])[:500]
+        )
     return found
 
 
@@ -280,11 +327,13 @@ def _listed(numbers: Sequence[int]) -> str:
     return f"{len(numbers)} from {numbers[0]} to {numbers[-1]}"
 
 
-def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
-    """Rows of all episodes, or of the episode ``only``. Raises DataSetError."""
+def read_rows(folder: Path, info: Info, only: int | None = None, losses: list[Loss] | None = None) -> EpisodeRows:
+    """Rows of all episodes, or of the episode ``only``. Raises DataSetError; with ``losses``, which receives what
+    cannot be read, only if nothing can.
+    """
     states = len(state_names(info, folder))
     needed = [STATE, "timestamp", "frame_index", "episode_index"]
-    tables = _tables(folder, "data", needed, only).values()
+    tables = _tables(folder, "data", needed, only, losses).values()
     with _reading(f"LeRobot data set {folder}: {', '.join(needed)} are to be numbers, as many in each row"):
         state, stamp, frame, episode = (
             np.concatenate([np.array(table[name], dtype=np.float64) for table in tables]) for name in needed
@@ -293,11 +342,24 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
         stamp, frame, episode = (values.reshape(len(state)) for values in (stamp, frame, episode))
     if state.shape[1] != states:
         raise _wrong(folder, f"{len(stamp)} rows of {state.shape[1]} states; info.json has {states}")
-    if not (np.isfinite(state).all() and (np.abs(stamp) <= LARGEST_STAMP_S).all()):
-        raise _wrong(folder, f"states that are not finite, or stamps beyond {LARGEST_STAMP_S:g} s")
-    counts = np.concatenate([frame, episode])
-    if not ((counts >= 0.0) & (counts <= MOST_COUNTED) & (counts == np.floor(counts))).all():
-        raise _wrong(folder, f"frame_index and episode_index are to be whole numbers from 0 to {MOST_COUNTED}")
+    counts = np.column_stack([frame, episode])
+    counted = ((counts >= 0.0) & (counts <= MOST_COUNTED) & (counts == np.floor(counts))).all(axis=1)
+    good = counted & np.isfinite(state).all(axis=1) & (np.abs(stamp) <= LARGEST_STAMP_S)
+    if not good.all():
+        lost = (
+            f"{len(good) - good.sum()} of {len(good)} rows cannot be used, the first one row {int(good.argmin())}: "
+            f"finite states, stamps up to {LARGEST_STAMP_S:g} s, and whole numbers up to {MOST_COUNTED} of frame_index "
+            "and episode_index are needed"
+        )
+        if losses is None or not good.any():
+            raise _wrong(folder, lost)
+        losses.append(Loss(lost))
+        state, stamp, frame, episode = state[good], stamp[good], frame[good], episode[good]
+    if losses is not None and only is None and info.total_episodes is not None:
+        absent = sorted(set(range(min(info.total_episodes, MOST_EPISODES))) - set(episode.tolist()))
+        losses += (
+            [Loss(f"no rows of {len(absent)} of {info.total_episodes} episodes: {_listed(absent)}")] if absent else []
+        )
     order = np.lexsort((frame, episode))
     episode, frame, stamp = episode[order].astype(np.int64), frame[order].astype(np.int64), stamp[order]
     together = np.diff(episode) == 0
@@ -316,23 +378,46 @@ def read_rows(folder: Path, info: Info, only: int | None = None) -> EpisodeRows:
 
 
 def pictures(
-    folder: Path, info: Info, key: str, rows: EpisodeRows, every: int = 1, *, gray: bool = False
+    folder: Path,
+    info: Info,
+    key: str,
+    rows: EpisodeRows,
+    every: int = 1,
+    *,
+    gray: bool = False,
+    losses: list[Loss] | None = None,
+    stamps_only: bool = False,
 ) -> Generator[tuple[int, Picture], None, None]:
-    """Every ``every``-th row and its image of one camera, in ``gray`` if requested. Raises DataSetError."""
+    """Every ``every``-th row and its image of one camera, in ``gray`` if requested. Raises DataSetError; with
+    ``losses``, which receives the images that are missing, only if none can be found. ``stamps_only``: those of videos
+    are looked for without decoding them, and their functions must not be called.
+    """
     kept = range(0, len(rows.stamp), every)
+
+    def lose(row: int, error: DataSetError) -> None:
+        if losses is None:
+            raise error
+        losses.append(Loss(str(error), _short(key), int(rows.episode[row]), int(rows.frame[row])))
+
     if info.features[key].dtype == "image":
-        yield from _stored_pictures(folder, key, rows, kept, gray=gray)
+        yield from _stored_pictures(folder, key, rows, kept, lose, gray=gray)
         return
     files: dict[Path, list[_Wanted]] = {}
-    place = _video_places(folder, info, key)
+    place = _video_places(folder, info, key, losses)
     for row in kept:
-        path, begin_s = place(int(rows.episode[row]))
+        try:
+            path, begin_s = place(int(rows.episode[row]))
+        except DataSetError as error:
+            lose(row, error)
+            continue
         files.setdefault(path, []).append(_Wanted(begin_s + int(rows.frame[row]) / info.fps, row))
     for path, wanted in files.items():
-        yield from _decoded(path, sorted(wanted), rows, 1.0 / info.fps, gray=gray)
+        period_s, wanted = 1.0 / info.fps, sorted(wanted)
+        frames = _stamps(path) if stamps_only else _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
+        yield from _decoded(path, wanted, rows, period_s, frames, lose, gray=gray)
 
 
-def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[Path, float]]:
+def _video_places(folder: Path, info: Info, key: str, losses: list[Loss] | None) -> Callable[[int], tuple[Path, float]]:
     """Function from an episode to the video file that holds it and the time [s] at which it begins there."""
     if info.video_path is None:
         raise _wrong(folder, "info.json has no video_path")
@@ -351,7 +436,7 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
         return own_file
     needed = [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
     places = {}
-    for table in _tables(folder, "meta/episodes", ["episode_index", *needed]).values():
+    for table in _tables(folder, "meta/episodes", ["episode_index", *needed], losses=losses).values():
         for episode, chunk, file, begin in zip(*(table[name] for name in ("episode_index", *needed)), strict=True):
             with _reading(f"LeRobot data set {folder}: meta/episodes, episode {episode}, {', '.join(needed)}"):
                 places[int(episode)] = file_of(chunk_index=int(chunk), file_index=int(file)), float(begin)
@@ -370,24 +455,34 @@ def _video_places(folder: Path, info: Info, key: str) -> Callable[[int], tuple[P
 
 
 def _decoded(
-    path: Path, wanted: list[_Wanted], rows: EpisodeRows, period_s: float, *, gray: bool
+    path: Path,
+    wanted: list[_Wanted],
+    rows: EpisodeRows,
+    period_s: float,
+    frames: Iterator[tuple[float, Any]],
+    lose: Lose,
+    *,
+    gray: bool,
 ) -> Iterator[tuple[int, Picture]]:
-    """Images of a video at their times. Raises DataSetError if it cannot be decoded or has no image at one of them."""
-    if not os.path.isfile(path):  # also for a name that the system does not accept
-        raise DataSetError("dataset", f"{path}: no such video")
-    frames = _frames(path, wanted[0].at_s - MOST_REORDERED * period_s)
-    last_s, (now_s, frame) = None, next(frames, (math.inf, None))
+    """Images among a video's ``frames`` at their times; ``lose`` is called for those that are missing or damaged."""
+    last_s, now_s, frame = -math.inf, -math.inf, None
+    broken: DataSetError | None = None
     for one in wanted:
-        while now_s < one.at_s - NEAR * period_s:
-            last_s, (now_s, frame) = now_s, next(frames, (math.inf, None))
+        try:
+            while now_s < one.at_s - NEAR * period_s:
+                last_s, (now_s, frame) = now_s, next(frames, (math.inf, None))
+        except DataSetError as error:
+            broken, now_s = error, math.inf
         if now_s > one.at_s + NEAR * period_s:
-            near = [f"{at_s:.3f} s" for at_s in (last_s, now_s) if at_s is not None and at_s < math.inf]
-            raise DataSetError(
+            near = [f"{at_s:.3f} s" for at_s in (last_s, now_s) if math.isfinite(at_s)]
+            missing = DataSetError(
                 "dataset",
                 f"{path}: no picture at {one.at_s:.3f} s (frame {rows.frame[one.row]} of episode "
                 f"{rows.episode[one.row]}); the nearest ones: {' and '.join(near) or 'none'}. Has it been copied as a "
                 "whole, and has it the data set's fps?",
             )
+            lose(one.row, broken or missing)
+            continue
 
         def take(frame: Any = frame) -> ImageArray:
             with _reading(path):
@@ -397,13 +492,30 @@ def _decoded(
         yield one.row, take
 
 
-def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
-    """Times [s] and frames of a video, starting at the key frame at or before ``from_s``."""
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """A video's container, in which there is a video. Raises DataSetError, also for errors inside."""
     import av  # of the extra that also brings pyarrow: see missing_extra
 
+    if not os.path.isfile(path):  # also for a name that the system does not accept
+        raise DataSetError("dataset", f"{path}: no such video")
     with _reading(path), av.open(str(path)) as container:
         if not container.streams.video:
             raise DataSetError("dataset", f"{path}: holds no video")
+        yield container
+
+
+def _stamps(path: Path) -> Iterator[tuple[float, None]]:
+    """Times [s] of a video's frames, without decoding them."""
+    with _opened(path) as container:
+        stream = container.streams.video[0]
+        stamps = [packet.pts for packet in container.demux(stream) if packet.pts is not None]
+        yield from ((float(stamp * stream.time_base), None) for stamp in sorted(stamps))
+
+
+def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, None]:
+    """Times [s] and frames of a video, starting at the key frame at or before ``from_s``."""
+    with _opened(path) as container:
         stream = container.streams.video[0]
         if from_s > 0.0:
             container.seek(math.floor(from_s / stream.time_base), stream=stream)
@@ -414,11 +526,11 @@ def _frames(path: Path, from_s: float) -> Generator[tuple[float, Any], None, Non
 
 
 def _stored_pictures(
-    folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], *, gray: bool
+    folder: Path, key: str, rows: EpisodeRows, kept: Sequence[int], lose: Lose, *, gray: bool
 ) -> Iterator[tuple[int, Picture]]:
     """Images that are stored in the tables, with at most one row group in memory."""
     places: dict[tuple[int, int], tuple[Path, int]] = {}
-    for path, table in _tables(folder, "data", ["episode_index", "frame_index"]).items():
+    for path, table in _tables(folder, "data", ["episode_index", "frame_index"], losses=[]).items():  # as of the rows
         with _reading(path):
             numbered = enumerate(zip(table["episode_index"], table["frame_index"], strict=True))
             places |= {(int(episode), int(frame)): (path, k) for k, (episode, frame) in numbered}
@@ -429,11 +541,16 @@ def _stored_pictures(
         path, position = places[numbers[row]]
         episode, frame = numbers[row]
         at = f"{key}: no picture that OpenCV reads at frame {frame} of episode {episode}"
-        if path != current or position < following:
-            cells, following = _cells(folder, path, key, position)
-            current = path
-        stored = next(islice(cells, position - following, None), None)
-        following = position + 1
+        try:
+            if path != current or position < following:
+                cells, following = _cells(folder, path, key, position)
+                current = path
+            stored = next(islice(cells, position - following, None), None)
+            following = position + 1
+        except DataSetError as error:
+            lose(row, error)
+            current = Path()
+            continue
 
         def take(picture: Any = stored, at: str = at) -> ImageArray:
             image = None

@@ -10,9 +10,10 @@ import pytest
 from canopen.objectdictionary import ODVariable
 
 from corrupted import corrupted_copies
+from stereoservo.messages.text_files import Remark
 from stereoservo.ports.devices import DriverError
 from stereoservo_drivers.canopen.cia402_configuration import SHIPPED_EDS, load_eds
-from stereoservo_drivers.canopen.eds_files import MOST_BYTES, EdsRemark, number_in, read_eds
+from stereoservo_drivers.canopen.eds_files import MOST_BYTES, number_in, read_eds
 
 SHIPPED = SHIPPED_EDS.read_text()
 DATA = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shared" / "data"))
@@ -33,12 +34,12 @@ def objects(dictionary: canopen.ObjectDictionary) -> Objects:
 
 WHOLE = objects(canopen.import_od(str(SHIPPED_EDS)))
 
-Read = Callable[[str | bytes], tuple[Objects, list[EdsRemark]]]
+Read = Callable[[str | bytes], tuple[Objects, list[Remark]]]
 
 
 @pytest.fixture
 def read(tmp_path: Path) -> Read:
-    def run(content: str | bytes) -> tuple[Objects, list[EdsRemark]]:
+    def run(content: str | bytes) -> tuple[Objects, list[Remark]]:
         path = tmp_path / "drive.eds"
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
         dictionary, remarks = read_eds(path)

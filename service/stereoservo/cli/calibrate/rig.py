@@ -4,7 +4,6 @@ recording or folders of pictures, calibrates, and formats the report.
 
 from __future__ import annotations
 
-import csv
 import time
 from contextlib import ExitStack
 from dataclasses import replace
@@ -27,7 +26,7 @@ from stereoservo.calibration.camera_rig.views import RigViews, still_places
 from stereoservo.calibration.trial_data import TrialCamera
 from stereoservo.cli.calibrate.command import CalibrateOptions
 from stereoservo.cli.doctor.cameras import SAME_REMEDY, lock_cameras, watch_cameras
-from stereoservo.cli.output import CommandError, log, shipped_or_path
+from stereoservo.cli.output import CommandError, log, read_columns, shipped_or_path
 from stereoservo.daemon.camera_setup import recorded_camera, video_of
 from stereoservo.daemon.cell_preparation import make_plan
 from stereoservo.daemon.ipc_messages import PlanOptions
@@ -107,12 +106,11 @@ def _layout(options: CalibrateOptions, board: tuple[int, int] | None, ids: tuple
     if options.layout is None:
         return None
     try:
-        with options.layout.open(newline="") as file:
-            table = {
-                int(row["id"]): [float(row[axis] or 0.0) for axis in "xyz" if axis in row]
-                for row in csv.DictReader(file)
-            }
-    except (OSError, KeyError, ValueError, TypeError) as error:
+        table = {
+            int(row["id"]): [float(row[axis] or 0.0) for axis in "xyz" if axis in row]
+            for _, row in read_columns(options.layout, ("id", "x", "y"), "layout")
+        }
+    except ValueError as error:
         raise CommandError(
             "layout", f"{options.layout}: {error!r}; columns id,x,y[,z] with metres are valid"
         ) from error

@@ -4,7 +4,6 @@ straight lines, fit, stored model, and its sources.
 
 from __future__ import annotations
 
-import csv
 import time
 from bisect import bisect_right
 from collections import defaultdict
@@ -18,7 +17,7 @@ import numpy as np
 
 from stereoservo.calibration.single_joint_fit import MIN_STOPS
 from stereoservo.calibration.trial_data import CalibrationError, TrialData, report_folder
-from stereoservo.cli.output import CommandError, log
+from stereoservo.cli.output import CommandError, log, read_columns
 from stereoservo.core.cycle import Event, PathFrame, PathRecord
 from stereoservo.core.monitor_state import ObservationStatistics
 from stereoservo.core.rest_averages import add_observation, averages, measurement_buffers
@@ -186,35 +185,23 @@ def read_lines(path: Path, sigma: float, data: Any) -> tuple[dict[str, Any], Lin
 
     sizes = {camera.name: (camera.width, camera.height) for camera in data.cameras}
     found: dict[str, dict[str, list[tuple[float, float]]]] = defaultdict(lambda: defaultdict(list))
-    try:
-        text = path.read_text(encoding="utf-8")
-    except OSError as error:
-        raise CommandError("lines", f"{path}: cannot be read: {error.strerror}") from error
-    except UnicodeDecodeError as error:
-        raise CommandError("lines", f"{path}: is not UTF-8 text: {error}") from error
-    reader = csv.DictReader(text.splitlines())
-    if reader.fieldnames is None or set(reader.fieldnames) != {"camera", "line", "u", "v"}:
-        raise CommandError("lines", f"{path}: the first row is {reader.fieldnames}; camera,line,u,v is needed")
-    for number, row in enumerate(reader, start=2):
+    for number, row in read_columns(path, ("camera", "line", "u", "v"), "lines"):
         try:
             pixel = float(row["u"]), float(row["v"])
-        except (TypeError, ValueError) as error:
-            raise CommandError("lines", f"{path}: row {number}: u and v are numbers [px]") from error
-        if None in row:
-            raise CommandError("lines", f"{path}: row {number}: has more than the four values camera,line,u,v")
+        except ValueError as error:
+            raise CommandError("lines", f"{path}: line {number}: u and v are numbers [px]") from error
         if row["camera"] not in sizes:
             raise CommandError(
-                "lines", f"{path}: row {number}: no camera {row['camera']!r}; cameras: {', '.join(sizes)}"
+                "lines", f"{path}: line {number}: no camera {row['camera']!r}; cameras: {', '.join(sizes)}"
             )
         width, height = sizes[row["camera"]]
         if not (-0.5 <= pixel[0] <= width - 0.5 and -0.5 <= pixel[1] <= height - 0.5):
             raise CommandError(
                 "lines",
-                f"{path}: row {number}: pixel ({pixel[0]:g}, {pixel[1]:g}) is outside the image of {width}x{height} px",
+                f"{path}: line {number}: pixel ({pixel[0]:g}, {pixel[1]:g}) is outside the image of {width}x{height} "
+                "px",
             )
         found[row["camera"]][row["line"]].append(pixel)
-    if not found:
-        raise CommandError("lines", f"{path}: holds no pixels; rows of camera,line,u,v are needed")
     lenses = {}
     for camera, of_camera in found.items():
         lines = [np.array(line) for line in of_camera.values()]

@@ -25,7 +25,7 @@ import typer
 from stereoservo.cli import interruption
 from stereoservo.cli.doctor.camera_findings import CameraRecord
 from stereoservo.cli.doctor.cameras import WatchedCamera
-from stereoservo.cli.doctor.command import examine_file, examine_pictures, line_of
+from stereoservo.cli.doctor.cell import examine_file, examine_pictures, line_of
 from stereoservo.cli.doctor.joints import examine_joints
 from stereoservo.cli.doctor.plate_motion import judge_turn, turn_between
 from stereoservo.cli.init import cell_text, toml_lines, toml_options

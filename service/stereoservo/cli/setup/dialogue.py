@@ -7,7 +7,6 @@ from __future__ import annotations
 import sys
 import threading
 import time
-import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from json import dumps as toml_string
@@ -15,6 +14,7 @@ from pathlib import Path
 from typing import TextIO, TypeVar
 
 from stereoservo.cli.output import CommandError
+from stereoservo.messages.text_files import complete, toml_of
 
 QUIET_S = 1.5
 """Time without output after which the current activity is printed again: after 3 s of silence a person assumes the end.
@@ -156,7 +156,7 @@ def _yes_or_no(text: str) -> bool:
 def read_answers(path: Path) -> dict[str, str]:
     """Answers by key, from a TOML file of strings. Raises CommandError."""
     try:
-        tree = tomllib.loads(path.read_text(encoding="utf-8"))
+        tree = complete(toml_of(path.read_bytes()))
     except OSError as error:
         raise CommandError("file", f"{path}: {error.strerror}") from error
     except ValueError as error:
