@@ -1,5 +1,5 @@
-"""Numbers in files of any kind (text, CSV, JSON, YAML, XML, NumPy) as tables of records, whatever separates, encloses or
-names them. A file may be understood as several tables; damaged records are NaN, so that the others keep their order.
+"""Numbers in files of any kind (text, CSV, JSON, YAML, XML, NumPy) as tables of records, whatever separates or names
+them. A file may be understood as several tables; damaged records are NaN, so that the others keep their order.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ class NumberFileError(Exception):
 
 
 class Table(NamedTuple):
-    """Records as columns: ``fields`` by name (n, k), NaN where a record lacks one; ``labels`` and ``lines`` (or numbers,
-    from 1) of the records; what is odd.
+    """Records as columns: ``fields`` by name (n, k), NaN where a record lacks one; ``labels`` and ``lines``
+    (or numbers, from 1) of the records; what is odd.
     """
 
     fields: dict[str, FloatArray]
@@ -358,7 +358,7 @@ def _row_records(lines: list[_Line]) -> _Records:
 
 
 def _matrices(lines: list[_Line]) -> _Records:
-    """One record a run of rows of three or four numbers, which ends with a row whose last number is 1, or after three."""
+    """One record a run of rows of three or four numbers that ends with a row whose last number is 1, or after three."""
     counts = Counter(len(line.values) for line in lines if line.count == len(line.values))
     width = 4 if counts[4] >= counts[3] else 3
     closed = any(line.values[3:] == [1.0] for line in lines)

@@ -426,7 +426,7 @@ def _pairs(views: int) -> tuple[IntArray, IntArray]:
 
 
 def _angle_misfit(poses: FloatArray, board: FloatArray) -> float:
-    """Median difference [rad] of the angles of rotation between views (k, 4, 4), which no hand-eye transform changes."""
+    """Median difference [rad] of the angles of rotation between views (k, 4, 4): no hand-eye transform changes them."""
     i, j = _pairs(len(poses))
     traces = [np.einsum("kij,kij->k", one[i, :3, :3], one[j, :3, :3]) for one in (poses, board)]
     arm, seen = (np.arccos(np.clip(0.5 * (trace - 1.0), -1.0, 1.0)) for trace in traces)
@@ -484,20 +484,24 @@ class _Candidate(NamedTuple):
 
 
 def _candidates(found: list[_Reading], pictures: Sequence[str], board: FloatArray | None) -> list[list[_Candidate]]:
-    """For each hypothesis of pairs the readings that may fit, the best first, and these by their best."""
-    by_match = []
-    for same in zip(*(_matches(one.table, pictures) for one in found), strict=False):
-        angles, views = [], []
+    """For each hypothesis of pairs the readings that may fit, the best first, and these by their best. Those whose
+    angles between views differ from the board's more than others are left out.
+    """
+    hypotheses = zip(*(_matches(one.table, pictures) for one in found), strict=False)
+    views = []
+    for k, same in enumerate(hypotheses):
         for reading, match in zip(found, same, strict=True):
-            poses = reading.poses[match.poses]
-            seen = np.full_like(poses, np.nan) if board is None else board[match.pictures]
-            both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(seen).all(axis=(1, 2))
-            views.append((poses[both], seen[both]) if both.sum() >= LEAST_VIEWS else None)
-            angles.append(0.0 if views[-1] is None else _angle_misfit(*views[-1]))
-        most = RATIO * (min(angles) + LEAST_ANGLE)
-        kept = zip(found, same, views, angles, strict=True)
-        made = [_Candidate(*one, None if of is None else _hand_eye(*of)) for *one, of, angle in kept if angle <= most]
-        by_match.append(sorted(made, key=lambda one: one.misfit))
+            poses, pair = reading.poses[match.poses], None
+            if board is not None:
+                both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(board[match.pictures]).all(axis=(1, 2))
+                pair = (poses[both], board[match.pictures][both]) if both.sum() >= LEAST_VIEWS else None
+            views.append((k, reading, match, pair, 0.0 if pair is None else _angle_misfit(*pair)))
+    most = RATIO * (min(angle for *_, angle in views) + LEAST_ANGLE)
+    made: dict[int, list[_Candidate]] = {}
+    for k, reading, match, pair, angle in views:
+        if angle <= most:
+            made.setdefault(k, []).append(_Candidate(reading, match, None if pair is None else _hand_eye(*pair)))
+    by_match = [sorted(one, key=lambda one: one.misfit) for one in made.values()]
     return sorted(by_match, key=lambda one: one[0].misfit)
 
 
