@@ -164,3 +164,131 @@ def test_random_poses_in_every_layout_are_read_as_they_were_or_asked_for(number:
             assert error.code == "ambiguous"
         else:
             assert difference(blind.poses, poses) < 2e-6, (name, layout, unit, blind.words)
+
+
+# -- which pose belongs to which picture, and what is damaged -------------------------------------------------
+
+
+def euler_file(folder: Path, poses: np.ndarray, name: str = "poses.txt") -> Path:
+    path = folder / name
+    path.write_text(texts(LAYOUTS["XYZ deg"](poses, 1000.0), " "))
+    return path
+
+
+def test_poses_are_paired_with_pictures_by_their_motion_where_counts_and_numbers_do_not(tmp_path: Path) -> None:
+    poses, board = scene(np.random.default_rng(1), views=20)
+    pictures = [f"view{k}.png" for k in range(1, 21)]
+    missing = euler_file(tmp_path, np.delete(poses, 7, axis=0))
+    found = read_poses([missing], pictures, board)
+    assert difference(found.poses, np.delete(poses, 7, axis=0)) < 2e-6
+    assert found.pictures.tolist() == [k for k in range(20) if k != 7]
+    assert any("pictures without partner: 7" in str(one) for one in found.findings)
+    with pytest.raises(PoseFileError, match="19 poses and 20 pictures") as refused:
+        read_poses([missing], pictures)
+    assert refused.value.code == "count"
+    shifted = read_poses([euler_file(tmp_path, poses)], pictures, np.roll(board, 1, axis=0))
+    assert shifted.pictures.tolist() == list(range(1, 20))
+    assert any("shifted by one" in str(one) for one in shifted.findings)
+
+
+def test_one_file_a_picture_is_paired_by_number_and_a_damaged_one_is_left_out_by_name(tmp_path: Path) -> None:
+    poses, _ = scene(np.random.default_rng(2), views=12)
+    paths = [tmp_path / f"T{k}.txt" for k in range(12)]
+    for path, pose in zip(paths, poses, strict=True):
+        path.write_text(texts(pose, " "))
+    paths[4].write_bytes(paths[4].read_bytes()[:60])
+    found = read_poses(paths[:9] + paths[10:], [f"pic{k:03}.jpg" for k in range(12)])
+    assert found.pictures.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 10, 11]
+    assert difference(found.poses, poses[found.pictures]) < 2e-6
+    listed = [str(one) for one in found.findings]
+    assert any("T4.txt" in one and "left out" in one for one in listed)
+    assert any("pictures without partner: 9" in one for one in listed)
+
+
+def test_inverted_poses_are_found_by_their_levers_or_stated(tmp_path: Path) -> None:
+    poses, board = scene(np.random.default_rng(3))
+    path = euler_file(tmp_path, np.linalg.inv(poses))
+    found = read_poses([path], PICTURES, board)
+    assert difference(found.poses, poses) < 2e-6
+    assert any("camera is on the hand" in str(one) for one in found.findings)
+    direct = read_poses([path], PICTURES, board, "direct")
+    assert difference(direct.poses, np.linalg.inv(poses)) < 2e-6
+
+
+def test_a_convention_that_nothing_decides_is_asked_for_and_taken_as_stated(tmp_path: Path) -> None:
+    poses, _ = scene(np.random.default_rng(4))
+    path = tmp_path / "poses.txt"
+    path.write_text(texts(LAYOUTS["wxyz"](poses, 1.0), " "))
+    with pytest.raises(PoseFileError, match="'xyzw' or 'wxyz'"):
+        read_poses([path], PICTURES)
+    assert difference(read_poses([path], PICTURES, stated="wxyz").poses, poses) < 2e-6
+    with pytest.raises(PoseFileError, match="words of those that the numbers allow are .*wxyz"):
+        read_poses([path], PICTURES, stated="zyxw")
+    named = tmp_path / "named.csv"
+    named.write_text(
+        "x_mm;y_mm;z_mm;roll_deg;pitch_deg;yaw_deg\n" + texts(LAYOUTS["XYZ deg"](0.1 * poses, 1000.0), ";")
+    )
+    assert read_poses([named], PICTURES).words == ("RzRyRx", "deg", "position-first", "mm")
+
+
+def test_joints_are_not_taken_for_poses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    path = tmp_path / "joints.txt"
+    path.write_text(texts(rng.uniform(-2.0, 2.0, (VIEWS, 6)), ","))
+    with pytest.raises(PoseFileError) as refused:
+        read_poses([path], PICTURES, scene(rng)[1])
+    assert refused.value.code == "no_fit"
+
+
+@pytest.mark.parametrize("name", sorted(WRITERS))
+def test_of_damaged_files_what_is_read_is_true(name: str, tmp_path: Path) -> None:
+    """Cut, and with bytes replaced: poses of the file or a refusal, and nothing else escapes."""
+    rng = np.random.default_rng(len(name))
+    poses, _ = scene(rng)
+    raw = WRITERS[name](LAYOUTS["rows"](poses, 1.0))
+    read = 0
+    for k in range(6):
+        damaged = bytearray(raw[: len(raw) * (k + 5) // 10])
+        if k == 5:
+            damaged[int(rng.integers(len(raw)))] = 0x21
+        (tmp_path / name).write_bytes(bytes(damaged))
+        try:
+            found = read_poses([tmp_path / name], PICTURES[: len(poses)] if k == 5 else ())
+        except PoseFileError:
+            continue
+        nearest = np.abs(found.poses[:, None] - poses[None]).max(axis=(2, 3)).min(axis=1)
+        read += (nearest < 2e-6).sum() >= len(nearest) - 1  # a digit may be another
+    assert read >= (0 if name.startswith("a.np") else 4)
+
+
+# -- recordings of real arms -----------------------------------------------------------------------------------
+
+
+REAL = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[3] / "shared" / "data")) / "hand_eye"
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason="no hand_eye in ../shared/data or $STEREOSERVO_DATA")
+@pytest.mark.parametrize("name", sorted(path.name for path in REAL.glob("*/")) or [""])
+def test_files_of_real_arms_are_read_as_they_were_converted(name: str) -> None:
+    folder = REAL / name
+    table = np.genfromtxt(folder / "poses.csv", delimiter=",", skip_header=1)
+    truth = rigid(Rotation.from_quat(table[:, 4:]), table[:, 1:4])
+    paths = sorted(folder.glob("original*/*")) or sorted(folder.glob("original*"))
+    pictures = [f"{k:03}.png" for k in range(len(truth))]
+    board = None
+    if name == "mycobot630_tag_a":
+        seen = [one["aruco_markers"][0] for one in json.loads(paths[0].read_text())]
+        turns = Rotation.from_rotvec([one["rotation_vector"] for one in seen])
+        board = rigid(turns, 1e-3 * np.array([one["translation_mm"] for one in seen]))
+    if name == "ur_l515_board":
+        grid = np.array([(k % 9, k // 9) for k in range(54)], dtype=np.float64)
+        pixels = np.full((len(truth), 54, 2), np.nan)
+        for k in range(0, len(truth), 3):  # enough of them to decide
+            image = cv2.imread(str(folder / "images" / f"{k:03}.jpg"), cv2.IMREAD_GRAYSCALE)
+            found, corners = cv2.findChessboardCorners(image, (9, 6))
+            if found:
+                pixels[k] = np.reshape(corners, (-1, 2))
+        board = board_poses(pixels, 0.0218 * grid, (960, 540))
+    read = read_poses(paths, pictures, board)
+    assert difference(read.poses, truth) < 1e-6
+    assert read.pictures.tolist() == list(range(len(truth)))

@@ -7,11 +7,13 @@ from __future__ import annotations
 import csv
 import io
 import re
+import zlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 from xml.etree import ElementTree
+from zipfile import BadZipFile
 
 import numpy as np
 import yaml
@@ -111,7 +113,7 @@ def _content(path: Path) -> tuple[list[tuple[Any, list[Remark]]], str, list[Rema
             return [(_arrays(raw), [])], "", []
         text, remarks = decoded_text(raw)
         return list(_trees(raw, text, remarks)), text, remarks
-    except (OSError, ValueError, EOFError, RecursionError) as error:
+    except (OSError, ValueError, EOFError, RecursionError, BadZipFile, zlib.error, NotImplementedError) as error:
         raise NumberFileError(f"{path} cannot be read: {error}") from error
 
 

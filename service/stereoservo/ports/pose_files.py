@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 import itertools
+import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
@@ -38,12 +39,14 @@ LARGEST_MISFIT = 0.15
 """Misfit (rotations [rad], translations relative to their size) above which a reading does not explain the board."""
 LEVERS = 3.0
 """Ratio of the hand's constant lever to the base's from which poses count as inverted."""
-WRONG_SIZE = 0.05
-"""Relative difference of the arm's lengths from the board's that is stated."""
+WRONG_SIZE = 0.1
+"""Relative difference of the arm's lengths from the board's that is stated: the focal length is a rough estimate."""
 NEARLY_HALF = 2.8
 """Angle [rad] between views from which the axis' sign is uncertain."""
 MOST_PAIRS, ROUNDS = 300, 6
 """Pairs of views, and reweighted fits, of a hand-eye transform."""
+LEAST_OF_LENS = 12
+"""Markers in a view from which the camera's principal point and distortion are estimated with the board's poses."""
 LEAST_VIEWS, LEAST_ANGLE = 4, 0.01
 """Views with a board from which it is compared with the arm, and its assumed error of rotation [rad]."""
 SAME = 1e-6
@@ -92,8 +95,9 @@ def read_poses(
             f"{_names(paths)}: no columns of poses; valid are a 4x4 or 3x4 matrix (16 or 12 numbers), x y z with a "
             "quaternion (7) and x y z with angles or a rotation vector (6), as text, CSV, JSON, YAML, XML or NumPy",
         )
-    nearest = min(abs(len(one.poses) - len(pictures)) for one in found)
-    found = [one for one in found if abs(len(one.poses) - len(pictures)) == nearest]
+    wanted = len(pictures) or max(len(one.poses) for one in found)
+    nearest = min(abs(len(one.poses) - wanted) for one in found)
+    found = [one for one in found if abs(len(one.poses) - wanted) == nearest]
     clearest = max(one.rank for one in found)
     found = _of_words([one for one in found if one.rank == clearest], {*words} - {*METRES, "inverted", "direct"})
     chosen, match, how, fit = _decided(found, pictures, board)
@@ -171,8 +175,10 @@ _UNIT = re.compile(r"[\s_]*[\[(]?\b(mm|cm|m|deg|degrees?|rad|°)[\])]?$")
 def _readings(table: Table) -> list[_Reading]:
     """All readings that the numbers themselves allow."""
     found: list[_Reading] = []
-    for names, values in _columns(table):
+    for names, values, placed in _columns(table):
         for words, rotations, positions in _layouts(values):
+            if placed and "position-last" in words:
+                continue
             good = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(positions).all(axis=1)
             R = np.where(good[:, None, None], rotations, np.eye(3))
             good &= (np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2)) < RIGID) & (np.linalg.det(R) > 0.0)
@@ -188,8 +194,12 @@ def _readings(table: Table) -> list[_Reading]:
     return arm or found
 
 
-def _columns(table: Table) -> Iterator[tuple[str, FloatArray]]:
-    """Columns (n, 16), (n, 12), (n, 7) or (n, 6) that may be poses, with their names."""
+_Columns = Iterator[tuple[str, FloatArray, bool]]
+"""Names, columns (n, 16), (n, 12), (n, 7) or (n, 6), and whether the position is known to be first."""
+
+
+def _columns(table: Table) -> _Columns:
+    """Columns that may be poses."""
     vectors = {name: values for name, values in table.fields.items() if values.shape[1] > 1}
     for name, values in vectors.items():
         yield from _unnamed(name, values)
@@ -198,11 +208,11 @@ def _columns(table: Table) -> Iterator[tuple[str, FloatArray]]:
         others = [one for one in places if one != name and re.search(r"rot|rvec|euler|rpy|angle|orient", one) is None]
         if others and (vectors[name].shape[1] > 3 or re.search(r"rot|rvec|euler|rpy|angle|orient|^r", name, re.I)):
             near = max(others, key=lambda one: difflib.SequenceMatcher(None, name, one).ratio())
-            yield f"{near} {name}", np.hstack([vectors[near], vectors[name]])
+            yield f"{near} {name}", np.hstack([vectors[near], vectors[name]]), True
     yield from _named_columns(table)
 
 
-def _named_columns(table: Table) -> Iterator[tuple[str, FloatArray]]:
+def _named_columns(table: Table) -> _Columns:
     """Columns of single numbers: those whose names end as a pose's do, or all as if they had none."""
     scalars = {name: values for name, values in table.fields.items() if values.shape[1] == 1}
     roles: dict[str, str] = {}
@@ -218,17 +228,17 @@ def _named_columns(table: Table) -> Iterator[tuple[str, FloatArray]]:
             roles = {one: roles[one] for one in first}
     if len(places) == 3 and len(roles) in (3, 4):
         used = [*places, *roles.values()]
-        yield " ".join(used), np.hstack([scalars[name] for name in used])
+        yield " ".join(used), np.hstack([scalars[name] for name in used]), True
     elif len(scalars) >= 6:
         yield from _unnamed(" ".join(scalars), np.hstack(list(scalars.values())))
 
 
-def _unnamed(name: str, values: FloatArray) -> Iterator[tuple[str, FloatArray]]:
+def _unnamed(name: str, values: FloatArray) -> _Columns:
     """The last columns of an array (n, k), where those before them count."""
     for size in (16, 12, 7, 6):
         extra = values.shape[1] - size
         if 0 <= extra <= MOST_EXTRA and (not extra or _counts(values[:, 0])):
-            yield name, values[:, extra:]
+            yield name, values[:, extra:], False
 
 
 def _counts(values: FloatArray) -> bool:
@@ -416,7 +426,7 @@ class _Fit(NamedTuple):
                 f"from it, and the other {self.base * metres:.2f} m from the base; --pose-format direct is the reverse"
             )
         if abs(np.log(self.scale * metres)) > WRONG_SIZE:
-            yield f"the arm's lengths are {self.scale * metres:.3g} of the board's: is the board's size right?"
+            yield f"the arm's lengths are about {self.scale * metres:.2g} of the board's: is the board's size right?"
 
 
 def _pairs(views: int) -> tuple[IntArray, IntArray]:
@@ -598,6 +608,62 @@ def _unit(reading: _Reading, fit: _Fit | None, stated: Sequence[str]) -> tuple[s
 _UNIT_NAMES = {"mm": r"mm\b|millim|_mm", "cm": r"\bcm\b|_cm|centim", "m": r"[\[(_ ]m[\])]?(?:\s|$)"}
 
 
+# -- a folder of pictures and poses ------------------------------------------------------------------------------
+
+
+PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm", ".webp")
+LEAST_PICTURES = 3
+"""Files whose names differ only in digits from which they are a set."""
+
+
+def picture_sets(folder: Path) -> dict[str, list[Path]]:
+    """The pictures of each camera in a folder or its subfolders, by their numbers: the largest set of files whose names
+    differ only in digits, and others as large.
+    """
+    sets = {key: paths for key, paths in _grouped(folder, PICTURES).items() if len(paths) >= LEAST_PICTURES}
+    most = max(map(len, sets.values()), default=0)
+    largest = [paths for paths in sets.values() if len(paths) == most]
+    names = [Path(os.path.relpath(paths[0].parent, folder)) / re.sub(r"\d.*", "", paths[0].stem) for paths in largest]
+    return {str(name).strip("/_-. ") or "camera": paths for name, paths in zip(names, largest, strict=True)}
+
+
+def pose_paths(folder: Path, stated: Path | None = None) -> list[Path]:
+    """The file, or files of one picture each, that hold poses: the stated one, or the only one in a folder.
+
+    Raises PoseFileError (``no_poses``, ``ambiguous``, ``unreadable``).
+    """
+    if stated is not None and not stated.is_dir():
+        return [stated]
+    groups = list(_grouped(stated or folder, SUFFIXES).values())
+    groups = [part for paths in groups for part in ([paths] if len(paths) >= LEAST_PICTURES else [[p] for p in paths])]
+    found = [paths for paths in groups if _hold_poses(paths)]
+    own = [paths for paths in found if paths == [folder / "poses.csv"]]
+    if len(own or found) != 1:
+        looked = ", ".join(_names(paths) for paths in found or groups) or "no file"
+        kinds = f"{len(found)} may be the poses" if found else f"none holds poses ({', '.join(SUFFIXES)} are read)"
+        raise PoseFileError("ambiguous" if found else "no_poses", f"{folder} has {looked}; {kinds}; give --poses FILE")
+    return (own or found)[0]
+
+
+def _hold_poses(paths: list[Path]) -> bool:
+    try:
+        return any(_readings(table) for table in read_tables(paths) if len(paths) > 1 or len(table.lines) > 1)
+    except NumberFileError:
+        return False
+
+
+def _grouped(folder: Path, suffixes: Sequence[str]) -> dict[tuple[Path, str], list[Path]]:
+    """Files of a folder and its subfolders by folder and name without digits, in the order of their numbers."""
+    groups: dict[tuple[Path, str], list[Path]] = {}
+    for path in sorted([*folder.glob("*"), *folder.glob("*/*")]):
+        if path.suffix.lower() in suffixes and path.name != "board.json" and path.is_file():
+            groups.setdefault((path.parent, re.sub(r"\d+", "", path.name.lower())), []).append(path)
+    for key, paths in groups.items():
+        numbers = numbers_of([path.stem for path in paths])
+        groups[key] = [path for _, path in sorted(zip(numbers or range(len(paths)), paths, strict=True))]
+    return groups
+
+
 def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Poses (f, 4, 4) of a plane board's ``points`` (m, 2) [m] in a camera with pictures of ``size`` [px], which is
     calibrated by them, from ``pixels`` (f, m, 2); NaN where fewer than four are seen.
@@ -608,8 +674,9 @@ def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -
     if len(views) < LEAST_VIEWS:
         return found
     space = np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
-    flags = cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_ZERO_TANGENT_DIST
-    flags |= cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3 | (cv2.CALIB_FIX_K1 if len(points) < 12 else 0)
+    flags = cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_K3
+    if seen.sum(axis=1).max() < LEAST_OF_LENS:
+        flags |= cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     camera = np.array([[max(size), 0.0, size[0] / 2.0], [0.0, max(size), size[1] / 2.0], [0.0, 0.0, 1.0]])
     _, _, _, turns, places = cv2.calibrateCamera(
         [space[seen[k]] for k in views],
