@@ -29,7 +29,7 @@ def rigid(rotations: Rotation, places: Any) -> np.ndarray:
 
 
 def scene(rng: np.random.Generator, on_hand: bool = True, views: int = VIEWS) -> tuple[np.ndarray, np.ndarray]:
-    """Poses (n, 4, 4) of a hand that points down within 50 degrees, and those of the board in the camera, with noise."""
+    """Poses (n, 4, 4) of a hand that points down within 50 degrees, and of the board in the camera, with noise."""
     turns = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (views, 3))) * Rotation.from_rotvec([np.pi, 0.0, 0.0])
     poses = rigid(
         turns * Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]), [0.5, 0, 0.5] + rng.uniform(-0.2, 0.2, (views, 3))
@@ -145,9 +145,18 @@ def difference(found: np.ndarray, poses: np.ndarray) -> float:
     return float(np.abs(found - poses).max()) if found.shape == poses.shape else np.inf
 
 
+def read_or_asked(file: Path) -> Any:
+    try:
+        return read_poses([file], PICTURES).poses
+    except PoseFileError as error:
+        if error.code != "ambiguous":
+            raise
+        return error.code
+
+
 @pytest.mark.parametrize("number", range(len(LAYOUTS)))
 def test_random_poses_in_every_layout_are_read_as_they_were_or_asked_for(number: int, tmp_path: Path) -> None:
-    """Each layout in one format and unit, more with STEREOSERVO_POSES=N: read right with a board, never wrong without."""
+    """Each in one format and unit, in N with STEREOSERVO_POSES=N: read right with a board, never wrong without."""
     layout = list(LAYOUTS)[number]
     rng = np.random.default_rng(100 + number)
     for k in range(int(os.environ.get("STEREOSERVO_POSES", "1"))):
@@ -158,12 +167,8 @@ def test_random_poses_in_every_layout_are_read_as_they_were_or_asked_for(number:
         file.write_bytes(write(LAYOUTS[layout](poses, scale)))
         found = read_poses([file], PICTURES, board)
         assert difference(found.poses, poses) < 2e-6, (name, layout, unit, found.words)
-        try:
-            blind = read_poses([file], PICTURES)
-        except PoseFileError as error:
-            assert error.code == "ambiguous"
-        else:
-            assert difference(blind.poses, poses) < 2e-6, (name, layout, unit, blind.words)
+        blind = read_or_asked(file)
+        assert isinstance(blind, str) or difference(blind, poses) < 2e-6, (name, layout, unit)
 
 
 # -- which pose belongs to which picture, and what is damaged -------------------------------------------------
@@ -222,7 +227,7 @@ def test_a_convention_that_nothing_decides_is_asked_for_and_taken_as_stated(tmp_
     with pytest.raises(PoseFileError, match="'xyzw' or 'wxyz'"):
         read_poses([path], PICTURES)
     assert difference(read_poses([path], PICTURES, stated="wxyz").poses, poses) < 2e-6
-    with pytest.raises(PoseFileError, match="words of those that the numbers allow are .*wxyz"):
+    with pytest.raises(PoseFileError, match=r"words of those that the numbers allow are .*wxyz"):
         read_poses([path], PICTURES, stated="zyxw")
     named = tmp_path / "named.csv"
     named.write_text(

@@ -112,7 +112,7 @@ def _content(path: Path) -> tuple[list[tuple[Any, list[Remark]]], str, list[Rema
         if raw[:6] == b"\x93NUMPY" or raw[:4] == b"PK\3\4":
             return [(_arrays(raw), [])], "", []
         text, remarks = decoded_text(raw)
-        return list(_trees(raw, text, remarks)), text, remarks
+        return list(_trees(text, remarks)), text, remarks
     except (OSError, ValueError, EOFError, RecursionError, BadZipFile, zlib.error, NotImplementedError) as error:
         raise NumberFileError(f"{path} cannot be read: {error}") from error
 
@@ -133,25 +133,23 @@ def _stacked(array: np.ndarray[Any, Any]) -> Any:
     return (np.moveaxis(array, -1, 0) if last else array).tolist()
 
 
-def _trees(raw: bytes, text: str, remarks: list[Remark]) -> Iterator[tuple[Any, list[Remark]]]:
+def _trees(text: str, remarks: list[Remark]) -> Iterator[tuple[Any, list[Remark]]]:
     begin = text.lstrip()[:1]
     if begin == "<":
         yield from _xml(text, remarks)
-    elif begin in ("[", "{"):
-        for whole in (True, False):
+    elif begin not in ("[", "{") and re.search(r"^\s*(?:- |[\w\"'][^:\n,;]*:(?:\s|$))", text, re.MULTILINE):
+        yield from _yaml(text, remarks)
+    elif "[" in text or begin == "{":
+        bare = _CALL.sub("", text).translate(_SQUARE)
+        for parts in ([text], [line for line in text.split("\n") if line], [bare]):
             try:
-                made = [
-                    json_of(one) for one in ([raw] if whole else [line.encode() for line in text.split("\n") if line])
-                ]
+                made = [json_of(part.encode()) for part in parts]
             except ValueError:
                 continue
-            yield _plain(made[0][0] if whole else [one for one, _ in made]), [odd for _, one in made for odd in one]
+            trees = [_plain(tree) for tree, _ in made]
+            yield trees[0] if len(trees) == 1 else trees, [*remarks, *(odd for _, one in made for odd in one)]
             return
-        yield from _yaml(text, remarks)
-    elif re.search(r"^\s*(?:- |[\w\"'][^:\n,;]*:(?:\s|$))", text, re.MULTILINE):
-        yield from _yaml(text, remarks)
-    elif "[" in text:
-        yield from _yaml(re.sub(r"^(?=\[)", "- ", _CALL.sub("", text).translate(_SQUARE), flags=re.MULTILINE), remarks)
+        yield from _yaml(re.sub(r"^(?=\[)", "- ", bare, flags=re.MULTILINE), remarks)
 
 
 _SQUARE = str.maketrans("()", "[]")

@@ -169,7 +169,7 @@ _NOT_THE_ARM = re.compile(
     r"cam(?!e$)|marker|board|target|tag(?![a-z]*_?pose)|aruco|object|corner|joint|intrinsic|dist", re.I
 )
 _ROLE = re.compile(r"(?:^|[^a-z]|[a-z]+[^a-z])(q?[wxyz]|q[0-4]|r[xyz]|roll|pitch|yaw|[abcprot]|alpha|beta|gamma)$")
-_UNIT = re.compile(r"[\s_]*[\[(]?\b(mm|cm|m|deg|degrees?|rad|°)[\])]?$")
+_UNIT = re.compile(r"[\s_]*[\[(](?:mm|cm|m|deg|rad|°)\w*[\])]$|[\s_]+(?:mm|cm|m|deg(?:rees?)?|rad(?:ians?)?|°)$")
 
 
 def _readings(table: Table) -> list[_Reading]:
@@ -392,13 +392,14 @@ def _numbering(table: Table) -> list[int] | None:
 
 class _Fit(NamedTuple):
     """A hand-eye transform fitted to poses and board. ``turn`` [rad], ``shift``: median misfit of the rotations, and of
-    the translations relative to their size, between views. ``scale``: of the poses' lengths to the board's [m].
-    ``on_hand``: whether the camera is on the hand, else the board. ``hand``, ``base``: distances of what is on the hand
+    the translations relative to their size, between views; ``mean`` [rad]: of the rotations. ``scale``: of the poses'
+    lengths to the board's [m]. ``on_hand``: whether the camera is on the hand, else the board. ``hand``, ``base``: distances of what is on the hand
     from it, and of the other from the base, in the poses' unit.
     """
 
     turn: float
     shift: float
+    mean: float
     scale: float
     on_hand: bool
     hand: float
@@ -477,7 +478,8 @@ def _fit(A: FloatArray, B: FloatArray, poses: FloatArray, board: FloatArray, on_
         return None
     other = np.einsum("kij,kj->ki", poses[:, :3, :3], x[:3] + x[3] * board[:, :3, 3] @ R.T) + poses[:, :3, 3]
     levers = float(np.linalg.norm(x[:3])), float(np.median(np.linalg.norm(other, axis=1)))
-    return _Fit(float(np.median(turns[sharp])), float(np.median(rest)) / size, float(x[3]), on_hand, *levers)
+    mean, turn, shift = float(turns[sharp].mean()), float(np.median(turns[sharp])), float(np.median(rest)) / size
+    return _Fit(turn, shift, mean, float(x[3]), on_hand, *levers)
 
 
 # -- the decision ----------------------------------------------------------------------------------------------
@@ -491,6 +493,11 @@ class _Candidate(NamedTuple):
     @property
     def misfit(self) -> float:
         return np.inf if self.fit is None else self.fit.misfit
+
+    @property
+    def mean(self) -> float:
+        """Mean misfit of rotations, to which a single wrong pair contributes."""
+        return np.inf if self.fit is None else self.fit.mean
 
 
 def _candidates(found: list[_Reading], pictures: Sequence[str], board: FloatArray | None) -> list[list[_Candidate]]:
@@ -512,7 +519,7 @@ def _candidates(found: list[_Reading], pictures: Sequence[str], board: FloatArra
         if angle <= most:
             made.setdefault(k, []).append(_Candidate(reading, match, None if pair is None else _hand_eye(*pair)))
     by_match = [sorted(one, key=lambda one: one.misfit) for one in made.values()]
-    return sorted(by_match, key=lambda one: one[0].misfit)
+    return sorted(by_match, key=lambda one: one[0].mean)
 
 
 def _decided(
@@ -528,9 +535,9 @@ def _decided(
     hypotheses = _candidates(distinct, pictures, board)
     firm = next((one for one in hypotheses if one[0].match.firm), None)
     likely = hypotheses[0]
-    if firm is not None and not RATIO * likely[0].misfit < firm[0].misfit:
+    if firm is not None and not RATIO * likely[0].mean < firm[0].mean:
         likely = firm
-    elif likely[0].misfit > LARGEST_MISFIT or any(one[0].misfit < RATIO * likely[0].misfit for one in hypotheses[1:]):
+    elif likely[0].misfit > LARGEST_MISFIT or any(one[0].mean < RATIO * likely[0].mean for one in hypotheses[1:]):
         raise _miscounted(distinct[0].table, pictures)
     best = likely[0]
     if len(distinct) == 1:
