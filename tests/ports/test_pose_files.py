@@ -32,7 +32,8 @@ def scene(rng: np.random.Generator, on_hand: bool = True, views: int = VIEWS) ->
     """Poses (n, 4, 4) of a hand that points down within 50 degrees, and of the board in the camera, with noise."""
     turns = Rotation.from_rotvec(rng.uniform(-0.5, 0.5, (views, 3))) * Rotation.from_rotvec([np.pi, 0.0, 0.0])
     poses = rigid(
-        turns * Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]), [0.5, 0, 0.5] + rng.uniform(-0.2, 0.2, (views, 3))
+        turns * Rotation.from_rotvec([0, 0, rng.uniform(-3, 3)]),
+        rng.uniform([0.3, -0.2, 0.3], [0.7, 0.2, 0.7], (views, 3)),
     )
     hand, base = rigid(Rotation.random(2, rng=rng), [rng.uniform(-0.1, 0.1, 3), rng.uniform(0.5, 0.9, 3)])
     board = np.linalg.inv(poses @ hand) @ base if on_hand else np.linalg.inv(base) @ poses @ hand

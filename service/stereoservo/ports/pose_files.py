@@ -391,10 +391,10 @@ def _numbering(table: Table) -> list[int] | None:
 
 
 class _Fit(NamedTuple):
-    """A hand-eye transform fitted to poses and board. ``turn`` [rad], ``shift``: median misfit of the rotations, and of
-    the translations relative to their size, between views; ``mean`` [rad]: of the rotations. ``scale``: of the poses'
-    lengths to the board's [m]. ``on_hand``: whether the camera is on the hand, else the board. ``hand``, ``base``: distances of what is on the hand
-    from it, and of the other from the base, in the poses' unit.
+    """A hand-eye transform fitted to poses and board. ``turn`` [rad], ``shift``: median misfit of the rotations between
+    views, and of the translations relative to their size; ``mean`` [rad]: of the rotations. ``scale``: of the poses'
+    lengths to the board's [m]. ``on_hand``: whether the camera is on the hand, else the board. ``hand``, ``base``:
+    distances of what is on the hand from it, and of the other from the base, in the poses' unit.
     """
 
     turn: float
@@ -529,7 +529,7 @@ def _decided(
     ``no_fit``).
     """
     distinct: list[_Reading] = []
-    for one in sorted(found, key=lambda one: -one.hints):
+    for one in sorted(found, key=lambda one: (-one.hints, -one.good().sum())):
         if not any(_same(one, other) for other in distinct):
             distinct.append(one)
     hypotheses = _candidates(distinct, pictures, board)
@@ -576,9 +576,11 @@ def _equal(rivals: list[_Candidate]) -> PoseFileError:
 
 
 def _same(one: _Reading, other: _Reading) -> bool:
-    if one.poses.shape != other.poses.shape or not np.array_equal(one.good(), other.good()):
+    """Whether two readings agree wherever both have poses."""
+    if one.poses.shape != other.poses.shape or not (both := one.good() & other.good()).any():
         return False
-    return bool(np.nanmax(np.abs(one.poses - other.poses)) < SAME * max(1.0, float(np.nanmax(np.abs(one.poses)))))
+    scale = max(1.0, float(np.abs(one.poses[both]).max()))
+    return bool(np.abs(one.poses[both] - other.poses[both]).max() < SAME * scale)
 
 
 def _miscounted(table: Table, pictures: Sequence[str]) -> PoseFileError:
