@@ -157,6 +157,8 @@ _SQUARE = str.maketrans("()", "[]")
 
 def _yaml(text: str, remarks: list[Remark]) -> Iterator[tuple[Any, list[Remark]]]:
     text = re.sub(r"^%YAML.*\n", "", text)
+    if re.search(r"(?:^|[\s\[,:-])\*\w", text):
+        return  # aliases of aliases grow without bound
     for _ in range(2):
         try:
             documents = [_plain(one) for one in yaml.load_all(text, _Yaml)]
@@ -189,7 +191,7 @@ _Yaml.add_constructor("tag:yaml.org,2002:timestamp", lambda _, node: node.value)
 
 
 def _xml(text: str, remarks: list[Remark]) -> Iterator[tuple[Any, list[Remark]]]:
-    parser = ElementTree.XMLPullParser(("start",))
+    parser: Any = ElementTree.XMLPullParser(("start",))
     try:
         parser.feed(re.sub(r"^\s*<\?xml.*?\?>", lambda one: "\n" * one[0].count("\n"), text, flags=re.DOTALL))
         parser.close()
@@ -281,7 +283,7 @@ class _Line(NamedTuple):
     values: list[float]
 
     @property
-    def count(self) -> int:
+    def known(self) -> int:
         return int(np.isfinite(self.values).sum())
 
 
@@ -292,7 +294,7 @@ def _float(text: str) -> float:
 def _text_records(text: str) -> Iterator[_Records]:
     """The rows of a text, its blocks of rows that are matrices, and all of it."""
     lines = _lines(text)
-    rows = [line for line in lines if line.count]
+    rows = [line for line in lines if line.known]
     if not rows:
         return
     yield _row_records(lines)
@@ -334,39 +336,39 @@ def _cells(line: str, separator: str | None) -> list[str]:
 
 def _row_records(lines: list[_Line]) -> _Records:
     """One record a row: the numbers of rows as wide as most, nothing of those that are damaged."""
-    data = [line for line in lines if 2 * line.count >= max(1, len(line.cells))] or [
-        line for line in lines if line.count
+    data = [line for line in lines if 2 * line.known >= max(1, len(line.cells))] or [
+        line for line in lines if line.known
     ]
     width = Counter(len(line.cells) for line in data).most_common(1)[0][0]
     of_width = [line for line in lines if len(line.cells) == width]
-    known = np.isfinite([line.values for line in of_width if line.count])
+    known = np.isfinite([line.values for line in of_width if line.known])
     columns, labels = (np.flatnonzero((known.mean(axis=0) > FREQUENT) == numeric) for numeric in (True, False))
-    header = next((line for line in reversed(of_width) if not line.count and line.number < data[0].number), None)
+    header = next((line for line in reversed(of_width) if not line.known and line.number < data[0].number), None)
     names = ["" if header is None else header.cells[k] for k in columns]
     records, remarks = [], []
     for line in lines:
         values = [line.values[k] for k in columns] if len(line.cells) == width else []
-        if values and line.count:
+        if values and line.known:
             label = next((line.cells[k] for k in labels if re.search(r"\d", line.cells[k])), "")
             fields = {"": values} if header is None else {n: [v] for n, v in zip(names, values, strict=True)}
             records.append(_Record(line.number, label, fields))
-        elif 2 * line.count >= width:
+        elif 2 * line.known >= width:
             records.append(_Record(line.number, "", {}))
-        elif line.count:
+        elif line.known:
             remarks.append(Remark(line.number, " ".join(line.cells)[:40], f"not {width} cells: left out", True))
     return records, remarks
 
 
 def _matrices(lines: list[_Line]) -> _Records:
     """One record a run of rows of three or four numbers that ends with a row whose last number is 1, or after three."""
-    counts = Counter(len(line.values) for line in lines if line.count == len(line.values))
+    counts = Counter(len(line.values) for line in lines if line.known == len(line.values))
     width = 4 if counts[4] >= counts[3] else 3
     closed = any(line.values[3:] == [1.0] for line in lines)
     most = 4 if closed or width == 3 else 3
     blocks: list[list[_Line]] = [[]]
     titles = [""]
     for line in lines:
-        inside = line.count == len(line.values) == width
+        inside = line.known == len(line.values) == width
         last = blocks[-1][-1:]
         if last and (not inside or last[0].values[3:] == [1.0] or (not closed and len(blocks[-1]) == most)):
             blocks.append([])

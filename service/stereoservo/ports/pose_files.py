@@ -9,9 +9,10 @@ import difflib
 import itertools
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -105,7 +106,7 @@ def read_poses(
     poses = chosen.poses[match.poses]
     poses[:, :3, 3] *= METRES[unit]
     inverted = "inverted" in words or ("direct" not in words and fit is not None and fit.inverted)
-    good = np.isfinite(poses).all(axis=(1, 2))
+    good = _finite(poses)
     texts = [
         f"{good.sum()} poses in {_names(paths)} are read as {chosen}; decided by {how}",
         f"lengths are in {unit}, by {by}",
@@ -117,7 +118,7 @@ def read_poses(
         for row in match.poses[~good].tolist()
     ]
     findings = (*chosen.table.remarks, *bad, *(Remark(0, "", text) for text in texts))
-    made = np.linalg.inv(poses[good]) if inverted else poses[good]
+    made: FloatArray = np.asarray(np.linalg.inv(poses[good]) if inverted else poses[good], dtype=np.float64)
     return PoseReading(made, match.pictures[good], (*chosen.words, unit, *["inverted"] * inverted), findings)
 
 
@@ -152,7 +153,7 @@ class _Reading(NamedTuple):
         return stated
 
     def good(self) -> BoolArray:
-        return np.asarray(np.isfinite(self.poses).all(axis=(1, 2)))
+        return _finite(self.poses)
 
 
 _EULER = tuple(f"R{a}R{b}R{c}" for a, b, c in itertools.permutations("xyz"))
@@ -179,7 +180,7 @@ def _readings(table: Table) -> list[_Reading]:
         for words, rotations, positions in _layouts(values):
             if placed and "position-last" in words:
                 continue
-            good = np.isfinite(rotations).all(axis=(1, 2)) & np.isfinite(positions).all(axis=1)
+            good = _finite(rotations) & _finite(positions)
             R = np.where(good[:, None, None], rotations, np.eye(3))
             good &= (np.abs(R.transpose(0, 2, 1) @ R - np.eye(3)).max(axis=(1, 2)) < RIGID) & (np.linalg.det(R) > 0.0)
             if good.sum() < max(1.0, (1.0 - MOST_BAD) * len(values)):
@@ -272,7 +273,7 @@ def _layouts(values: FloatArray) -> Iterator[tuple[tuple[str, ...], FloatArray, 
 def _angles_or_quaternion(
     turns: FloatArray, positions: FloatArray, place: str
 ) -> Iterator[tuple[tuple[str, ...], FloatArray, FloatArray]]:
-    good = np.isfinite(turns).all(axis=1)
+    good = _finite(turns)
     if turns.shape[1] == 4:
         good &= np.abs(np.linalg.norm(turns, axis=1) - 1.0) < UNIT_NORM
         for word, order in (("xyzw", [0, 1, 2, 3]), ("wxyz", [1, 2, 3, 0])):
@@ -285,15 +286,19 @@ def _angles_or_quaternion(
         yield ("rotation-vector", unit, place), _rotations(good, Rotation.from_rotvec, angles), positions
         for name in (*_EULER, "RzRyRz", "RzRxRz"):
             axes = name.replace("R", "").upper()
-            by_axis = [("", angles[:, ["XYZ".index(a) for a in axes]])] if len(set(axes)) == 3 else [("", angles)]
-            if len(set(axes)) == 3:
-                by_axis.append(("angles-zyx", angles[:, ["ZYX".index(a) for a in axes]]))
-            for order, ordered in by_axis:
-                R = _rotations(good, lambda one, axes=axes: Rotation.from_euler(axes, one), ordered)
-                yield tuple(word for word in (name, order, unit, place) if word), R, positions
+            orders = {"": "XYZ", "angles-zyx": "ZYX"} if len(set(axes)) == 3 else {"": ""}
+            for word, columns in orders.items():
+                ordered = angles[:, [columns.index(axis) for axis in axes]] if columns else angles
+                R = _rotations(good, partial(Rotation.from_euler, axes), ordered)
+                yield tuple(one for one in (name, word, unit, place) if one), R, positions
 
 
-def _rotations(good: BoolArray, make: Any, values: FloatArray) -> FloatArray:
+def _finite(values: FloatArray) -> BoolArray:
+    """Mask (n,) of the rows of values (n, ...) without NaN."""
+    return np.asarray(np.isfinite(values).reshape(len(values), -1).all(axis=1))
+
+
+def _rotations(good: BoolArray, make: Callable[[FloatArray], Rotation], values: FloatArray) -> FloatArray:
     found = np.full((len(values), 3, 3), np.nan)
     if good.any():
         found[good] = make(values[good]).as_matrix()
@@ -361,7 +366,8 @@ def _matches(table: Table, pictures: Sequence[str]) -> Iterator[_Match]:
         every = np.arange(max(n, p))
         for k in range(len(every)) if abs(n - p) == 1 else range(abs(n - p) + 1):
             fewer = np.delete(every, k).tolist() if abs(n - p) == 1 else (k + every[: min(n, p)]).tolist()
-            yield _match(*((fewer, every.tolist()) if n < p else (every.tolist(), fewer)), "in their order", False)
+            own, others = (fewer, every.tolist()) if n < p else (every.tolist(), fewer)
+            yield _match(own, others, "in their order", False)
 
 
 def _match(own: Sequence[int], others: Sequence[int], how: str, firm: bool) -> _Match:
@@ -373,7 +379,8 @@ def _match(own: Sequence[int], others: Sequence[int], how: str, firm: bool) -> _
         for name, keys in (("poses", sorted({*own} - {*others})), ("pictures", sorted({*others} - {*own})))
         if keys
     ]
-    return _Match(*pairs.T, "; ".join([f"poses and pictures are paired {how}", *left]) if how else "", firm)
+    remark = "; ".join([f"poses and pictures are paired {how}", *left]) if how else ""
+    return _Match(pairs[:, 0], pairs[:, 1], remark, firm)
 
 
 def _numbering(table: Table) -> list[int] | None:
@@ -447,7 +454,7 @@ def _angle_misfit(poses: FloatArray, board: FloatArray) -> float:
 def _hand_eye(poses: FloatArray, board: FloatArray) -> _Fit | None:
     """The better fit of both mounts to poses and board (k, 4, 4) of the same views; None where there is none."""
     i, j = _pairs(len(poses))
-    arm, back = np.linalg.inv(poses[j]) @ poses[i], np.linalg.inv(board)
+    arm, back = np.linalg.inv(poses[j]) @ poses[i], np.asarray(np.linalg.inv(board), dtype=np.float64)
     held = _fit(arm, board[j] @ back[i], poses, board, True), _fit(arm, back[j] @ board[i], poses, back, False)
     return min((one for one in held if one is not None), key=lambda one: one.misfit, default=None)
 
@@ -510,7 +517,7 @@ def _candidates(found: list[_Reading], pictures: Sequence[str], board: FloatArra
         for reading, match in zip(found, same, strict=True):
             poses, pair = reading.poses[match.poses], None
             if board is not None:
-                both = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(board[match.pictures]).all(axis=(1, 2))
+                both = _finite(poses) & _finite(board[match.pictures])
                 pair = (poses[both], board[match.pictures][both]) if both.sum() >= LEAST_VIEWS else None
             views.append((k, reading, match, pair, 0.0 if pair is None else _angle_misfit(*pair)))
     most = RATIO * (min(angle for *_, angle in views) + LEAST_ANGLE)
@@ -678,7 +685,7 @@ def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -
     calibrated by them, from ``pixels`` (f, m, 2); NaN where fewer than four are seen.
     """
     found = np.full((len(pixels), 4, 4), np.nan)
-    seen = np.isfinite(pixels).all(axis=2)
+    seen = np.asarray(np.isfinite(pixels).all(axis=2))
     views = np.flatnonzero(seen.sum(axis=1) >= LEAST_VIEWS)
     if len(views) < LEAST_VIEWS:
         return found
@@ -687,14 +694,9 @@ def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -
     if seen.sum(axis=1).max() < LEAST_OF_LENS:
         flags |= cv2.CALIB_FIX_PRINCIPAL_POINT | cv2.CALIB_FIX_ASPECT_RATIO | cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     camera = np.array([[max(size), 0.0, size[0] / 2.0], [0.0, max(size), size[1] / 2.0], [0.0, 0.0, 1.0]])
-    _, _, _, turns, places = cv2.calibrateCamera(
-        [space[seen[k]] for k in views],
-        [pixels[k, seen[k]].astype(np.float32) for k in views],
-        size,
-        camera,
-        None,
-        flags=flags,
-    )
+    shown = [np.flatnonzero(seen[k]) for k in views]
+    images = [pixels[k, one].astype(np.float32) for k, one in zip(views, shown, strict=True)]
+    _, _, _, turns, places = cv2.calibrateCamera([space[one] for one in shown], images, size, camera, None, flags=flags)
     found[views] = np.eye(4)
     found[views, :3, :3] = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
     found[views, :3, 3] = np.reshape(places, (-1, 3))
