@@ -54,9 +54,11 @@ class _Record(NamedTuple):
 
 _Records = tuple[list[_Record], list[Remark]]
 _NUMBER = re.compile(r"[-+]?(?:\d+[.,]?\d*|[.,]\d+)(?:[eEdD][-+]?\d+)?|[-+]?(?:nan|inf)", re.IGNORECASE)
-_CALL = re.compile(r"(?:\b[A-Za-z_][\w.]*\s*[:=]\s*)?(?:\b[A-Za-z_][\w.]*\s*)?(?=[\[({])|\bdtype\s*=\s*[\w.]+")
+_CALL = re.compile(
+    r"(?:\b[A-Za-z_][\w.]*\s*[:=]\s*)?(?:\b[A-Za-z_][\w.]*\s*)?(?=[\[({]\s*[-+.\d\[({])|\bdtype\s*=\s*[\w.]+"
+)
 """What stands before a bracket in a program's text: ``T1 = np.array([…], dtype=float)``."""
-_NAMED = re.compile(r"\b[A-Za-z_]\w*\s*[=:]\s*(?=[-+.\d])")
+_NAMED = re.compile(r"(?:\b[A-Za-z_]\w*\s*[=:]\s*|(?<![\w.])[A-Za-z][xyzXYZ]?\s+)(?=[-+.\d])")
 _COMMENT = re.compile(r"(?:#|%|//)+\s*")
 
 
