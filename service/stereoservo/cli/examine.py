@@ -524,7 +524,8 @@ def _detector(path: Path, name: str, options: dict[str, Any], camera: str) -> De
 def _pictures_with_poses(
     folder: Path, pictures: dict[str, list[Path]], stated: Path | None, pose_format: str
 ) -> RecordedViews:
-    frames, board, notes = GatheredFrames({}), None, []
+    frames, notes = GatheredFrames({}), list[str]()
+    board: tuple[FloatArray, FloatArray, tuple[int, int]] | None = None
     names = [path.name for path in next(iter(pictures.values()))]
     for camera, paths in pictures.items():
         detector, points = _board(folder, camera)
@@ -549,11 +550,12 @@ def _pictures_with_poses(
             continue
         frames.seen |= found
         if board is None and points is not None:
-            board = board_poses(pixels, points, frames.sizes[camera])
+            board = pixels, points, frames.sizes[camera]
     if not frames.sizes:
         raise CommandError("dataset", f"{folder}: {'; '.join(notes)}; is the board as {BOARD} or {DETECTOR} has it?")
     try:
-        read = read_poses(pose_paths(folder, stated), names, board, pose_format)
+        motion = None if board is None else board_poses(*board)
+        read = read_poses(pose_paths(folder, stated), names, motion, pose_format)
     except PoseFileError as error:
         raise CommandError("dataset", str(error)) from error
     order = np.argsort(read.pictures)

@@ -683,6 +683,8 @@ def _grouped(folder: Path, suffixes: Sequence[str]) -> dict[tuple[Path, str], li
 def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -> FloatArray:
     """Poses (f, 4, 4) of a plane board's ``points`` (m, 2) [m] in a camera with pictures of ``size`` [px], which is
     calibrated by them, from ``pixels`` (f, m, 2); NaN where fewer than four are seen.
+
+    Raises PoseFileError (``no_fit``).
     """
     found = np.full((len(pixels), 4, 4), np.nan)
     seen = np.asarray(np.isfinite(pixels).all(axis=2))
@@ -696,7 +698,14 @@ def board_poses(pixels: FloatArray, points: FloatArray, size: tuple[int, int]) -
     camera = np.array([[max(size), 0.0, size[0] / 2.0], [0.0, max(size), size[1] / 2.0], [0.0, 0.0, 1.0]])
     shown = [np.flatnonzero(seen[k]) for k in views]
     images = [pixels[k, one].astype(np.float32) for k, one in zip(views, shown, strict=True)]
-    _, _, _, turns, places = cv2.calibrateCamera([space[one] for one in shown], images, size, camera, None, flags=flags)
+    try:
+        _, _, _, turns, places = cv2.calibrateCamera(
+            [space[one] for one in shown], images, size, camera, None, flags=flags
+        )
+    except cv2.error as error:
+        raise PoseFileError(
+            "no_fit", f"OpenCV calibrates no camera by the board in {len(views)} pictures: {error}"
+        ) from error
     found[views] = np.eye(4)
     found[views, :3, :3] = Rotation.from_rotvec(np.reshape(turns, (-1, 3))).as_matrix()
     found[views, :3, 3] = np.reshape(places, (-1, 3))
