@@ -12,8 +12,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from stereoservo.calibration.examination.recorded_views import RecordedViews
+from stereoservo.calibration.known_arm import free_arm
 from stereoservo.cli.examine import read_folder
 from stereoservo.cli.main import invoke
 from stereoservo_sim.experiments.examined_recordings import examined_case
@@ -137,6 +139,68 @@ def test_a_flight_without_trial_motions_is_judged_by_the_model_in_it(
     assert report["stratum"] == "metric"
     assert report["causes"] == []
     assert 0.05 < report["rms_px"] < 0.2
+
+
+def folder_of_pictures(folder: Path) -> np.ndarray:
+    """Pictures of a chessboard from a hand, numbered from 1, its poses (n, 4, 4) by rotation vectors and millimetres
+    with decimal commas, as a spreadsheet leaves them, and the board.
+    """
+    rng = np.random.default_rng(7)
+    squares = np.kron(np.indices((7, 8)).sum(axis=0) % 2, np.ones((40, 40))) * 255
+    sheet = np.pad(squares, 40, constant_values=255).astype(np.uint8)
+    K, views = np.array([[700.0, 0.0, 320.0], [0.0, 700.0, 240.0], [0.0, 0.0, 1.0]]), 8
+    rigid = np.tile(np.eye(4), (views + 2, 1, 1))
+    turns = rng.uniform(-0.4, 0.4, (views + 2, 3)) + np.concatenate([np.zeros((views, 3)), [[0, 0, 2], [3, 0, 0]]])
+    rigid[:, :3, :3] = Rotation.from_rotvec(turns).as_matrix()
+    rigid[:, :3, 3] = rng.uniform(-0.02, 0.02, (views + 2, 3)) + np.array(
+        [[-0.05, -0.04, 0.45]] * views + [[0.0, 0.0, 0.1], [0.6, 0.0, 0.0]]
+    )
+    board, (hand, base) = rigid[:views], rigid[views:]
+    to_metres = np.array([[0.00057, 0.0, -0.05], [0.0, 0.00057, -0.05], [0.0, 0.0, 1.0]])
+    for k, one in enumerate(board, 1):
+        homography = K @ one[:3, [0, 1, 3]] @ to_metres
+        cv2.imwrite(str(folder / f"view{k}.png"), cv2.warpPerspective(sheet, homography, (640, 480), borderValue=255))
+    poses: np.ndarray = base @ np.linalg.inv(board) @ np.linalg.inv(hand)
+    values = np.hstack([1e3 * poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_rotvec()])
+    rows = [";".join([str(k), *(f"{value:.6f}" for value in row)]).replace(".", ",") for k, row in enumerate(values)]
+    (folder / "positionen.csv").write_text("\n".join(["Größe in mm", *rows]), encoding="utf-16")
+    (folder / "board.json").write_text('{"type": "chessboard", "rows": 6, "cols": 7, "square_m": 0.0228}')
+    return poses
+
+
+def test_pictures_and_poses_in_a_convention_that_nobody_states_are_read(tmp_path: Path) -> None:
+    poses = folder_of_pictures(tmp_path)
+    views = read_folder(tmp_path)
+    assert np.abs(views.positions - free_arm(poses)[0]).max() < 1e-5
+    assert len(views.times) == len(poses)
+    assert views.seen.all()
+    notes = "; ".join(views.notes)
+    assert "rotation-vector rad position-first" in notes
+    assert "lengths are in mm" in notes
+    assert "poses from 0 and pictures from 1" in notes
+
+
+@pytest.mark.parametrize(
+    ("damage", "named"),
+    [
+        (lambda folder: (folder / "positionen.csv").unlink(), "none holds poses"),
+        (lambda folder: (folder / "board.json").unlink(), "detector.toml"),
+        (lambda folder: (folder / "board.json").write_text('{"type": "circles"}'), "type (chessboard or aruco)"),
+        (lambda folder: (folder / "board.json").write_text(EVEN), "alike after half a turn"),
+        (lambda folder: shutil.copy(folder / "positionen.csv", folder / "others.csv"), "give --poses FILE"),
+    ],
+)
+def test_pictures_that_cannot_be_read_with_poses_are_refused_with_what_is_needed(
+    damage: Any, named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder_of_pictures(tmp_path)
+    damage(tmp_path)
+    code, answer = told(capsys, str(tmp_path))
+    assert code == 1
+    assert named in answer["error"]["message"]
+
+
+EVEN = '{"type": "chessboard", "rows": 6, "cols": 8, "square_m": 0.02}'
 
 
 def real_set() -> Path | None:

@@ -28,8 +28,10 @@ from stereoservo.messages.text_files import complete, toml_of
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports import lerobot, plugins
 from stereoservo.ports.clock import MonotonicClock
-from stereoservo.ports.devices import CameraObservation, Detector, DriverContext, Frame
+from stereoservo.ports.devices import CameraObservation, Detector, DriverContext, DriverError, Frame
 from stereoservo.ports.lerobot import UNITS, is_data_set
+from stereoservo.ports.number_files import NumberFileError, read_tree
+from stereoservo.ports.pose_files import PoseFileError, board_poses, picture_sets, pose_paths, read_poses
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, recorded_messages
 from stereoservo.recording.step_layout import decode_step
@@ -52,6 +54,16 @@ def examine(
         Path | None,
         typer.Option(help="Of a LeRobot data set: the file that names the detector. Default: detector.toml in it."),
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Of a folder of pictures: the file, or folder of files, with the hand's poses."
+        ),
+    ] = None,
+    pose_format: Annotated[
+        str,
+        typer.Option(help="What is known of these poses, such as mm,wxyz or inverted. Default: found from the data."),
+    ] = "",
     json: JsonOption = False,
 ) -> None:
     """Judge a recording of joints and pictures: bumped cameras, drifted zeros, late stamps, dropped frames.
@@ -64,7 +76,7 @@ def examine(
     elif any(one is not None for one in (units, cameras, detector)):
         raise CommandError("dataset", f"--units, --cameras and --detector are for LeRobot data sets; {dataset} is none")
     elif dataset.is_dir():
-        views = read_folder(dataset)
+        views = read_folder(dataset, poses, pose_format)
     elif dataset.is_file():
         views = read_flight(dataset)
     else:
@@ -299,7 +311,7 @@ def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
 
 
 JOINTS, POSES, MARKERS, FRAMES, CAMERAS = ("joints.csv", "poses.csv", "markers.csv", "frames.csv", "cameras.csv")
-DETECTOR = "detector.toml"
+DETECTOR, BOARD = "detector.toml", "board.json"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
 STATED_PX = 0.1
@@ -313,15 +325,19 @@ Rows = list[tuple[int, dict[str, str]]]
 """Rows of a table, each with its line."""
 
 
-def read_folder(folder: Path) -> RecordedViews:
-    """The recording in a folder. Raises CommandError naming file, row, value and what would be valid."""
+def read_folder(folder: Path, poses: Path | None = None, pose_format: str = "") -> RecordedViews:
+    """The recording in a folder: tables, or pictures with a board and ``poses`` of any ``pose_format``. Raises
+    CommandError naming file, row, value and what would be valid.
+    """
     given = [name for name in (JOINTS, POSES) if (folder / name).is_file()]
     seen = [name for name in (MARKERS, FRAMES) if (folder / name).is_file()]
+    if not seen and JOINTS not in given and (pictures := picture_sets(folder)):
+        return _pictures_with_poses(folder, pictures, poses, pose_format)
     if len(given) != 1 or len(seen) != 1:
         raise CommandError(
             "dataset",
             f"{folder} has {', '.join(given + seen) or 'no table'}; one of {JOINTS} and {POSES}, and one of {MARKERS} "
-            f"and {FRAMES} are needed",
+            f"and {FRAMES} are needed, or pictures with {BOARD} and a file of poses",
         )
     motion = _table(folder / given[0])
     key = _time_column(folder / given[0], motion)
@@ -418,7 +434,12 @@ def _poses(
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
     poses[:, :3, 3] = values[:, :3]
-    positions, generators, _ = free_arm(poses[order])
+    return _arm_of_poses(poses[order])
+
+
+def _arm_of_poses(poses: FloatArray) -> tuple[tuple[str, ...], tuple[Kind, ...], FloatArray, FloatArray]:
+    """Names, kinds, positions (j, 6) and generators of the free arm that makes ``poses`` (j, 4, 4) [m]."""
+    positions, generators, _ = free_arm(poses)
     # Unwrap turns beyond half a turn.
     return NAMES, KINDS, np.hstack([positions[:, :3], np.unwrap(positions[:, 3:], axis=0)]), generators
 
@@ -495,9 +516,93 @@ def stated_detector(path: Path, camera: str) -> Detector:
         raise CommandError(
             "dataset", f"{path}: detector = {name!r}, options = {options!r}; a name and a table are valid"
         )
+    return _detector(path, name, options, camera)
+
+
+def _detector(path: Path, name: str, options: dict[str, Any], camera: str) -> Detector:
+    """A detector that a file names."""
     context = DriverContext(MonotonicClock(), "examine", path.parent, path.parent, camera=camera)
-    made: Detector = plugins.load(plugins.DETECTORS, name)(options, context)
+    try:
+        made: Detector = plugins.load(plugins.DETECTORS, name)(options, context)
+    except DriverError as error:
+        raise CommandError("dataset", f"{path}: {error}") from error
     return made
+
+
+# -- pictures with a board, and poses as people have them -------------------------------------------------------
+
+
+def _pictures_with_poses(
+    folder: Path, pictures: dict[str, list[Path]], stated: Path | None, pose_format: str
+) -> RecordedViews:
+    frames, notes = GatheredFrames({}), list[str]()
+    board: tuple[FloatArray, FloatArray, tuple[int, int]] | None = None
+    names = [path.name for path in next(iter(pictures.values()))]
+    for camera, paths in pictures.items():
+        detector, points = _board(folder, camera)
+        pixels = np.full((len(paths), 0 if points is None else len(points), 2), np.nan)
+        found: dict[tuple[str, float], tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
+        for k, path in enumerate(paths):
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            size = None if image is None else (image.shape[1], image.shape[0])
+            if image is None or size is None or frames.sizes.setdefault(camera, size) != size:
+                notes.append(f"{path}: no picture, or of another size than the others: left out")
+                continue
+            markers = detected(detector, camera, k, image)
+            found[camera, float(k)] = k, 0, markers
+            for marker, (u, v, _) in markers.items():
+                if marker < pixels.shape[1]:
+                    pixels[k, marker] = u, v
+        shown = sum(bool(markers) for _, _, markers in found.values())
+        log(f"camera {camera}: markers in {shown} of {len(paths)} pictures")
+        if not shown:
+            notes.append(f"camera {camera} shows the board in none of its {len(paths)} pictures, and is left out")
+            frames.sizes.pop(camera, None)
+            continue
+        frames.seen |= found
+        if board is None and points is not None:
+            board = pixels, points, frames.sizes[camera]
+    if not frames.sizes:
+        raise CommandError("dataset", f"{folder}: {'; '.join(notes)}; is the board as {BOARD} or {DETECTOR} has it?")
+    try:
+        motion = None if board is None else board_poses(*board)
+        read = read_poses(pose_paths(folder, stated), names, motion, pose_format)
+    except PoseFileError as error:
+        raise CommandError("dataset", str(error)) from error
+    order = np.argsort(read.pictures)
+    notes += [str(one) for one in read.findings]
+    arm = _arm_of_poses(read.poses[order])
+    return replace(gathered_views(frames, read.pictures[order].astype(float), *arm, False), notes=tuple(notes))
+
+
+def _board(folder: Path, camera: str) -> tuple[Detector, FloatArray | None]:
+    """Detector of the board that a folder describes, and the places (m, 2) [m] of its markers; None where unknown."""
+    path = folder / BOARD
+    if not path.is_file():
+        return stated_detector(folder / DETECTOR, camera), None
+    try:
+        tree = read_tree(path)
+        sizes = {name: float(tree[name]) for name in ("rows", "cols", "square_m") if name in tree}
+        kind, rows, columns, side = tree["type"], int(sizes["rows"]), int(sizes["cols"]), sizes["square_m"]
+    except (NumberFileError, KeyError, TypeError, ValueError) as error:
+        raise CommandError(
+            "dataset",
+            f"{path}: {error}; needed are type (chessboard or aruco), rows and cols of inner corners, square_m, for "
+            "aruco also dictionary and tags",
+        ) from error
+    if kind == "chessboard":
+        corners = np.array([(k % columns, k // columns) for k in range(rows * columns)], dtype=np.float64)
+        return _detector(path, kind, {"columns": columns, "rows": rows}, camera), side * corners
+    if kind == "aruco" and isinstance(tags := tree.get("tags"), list):
+        options = {"tags": tags, "dictionary": tree.get("dictionary", "36h11")}
+        square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+        places = side * square if len(tags) == 1 else None
+        if places is not None:  # marker c of tag t is 4 t + c
+            places = np.vstack([np.full((4 * int(tags[0]), 2), np.nan), places])
+        return _detector(path, kind, options, camera), places
+    raise CommandError(
+        "dataset", f"{path}: type {kind!r}; chessboard, and aruco with its tags, are valid; or {DETECTOR}"
+    )
 
 
 # -- tables ---------------------------------------------------------------------------------------------------
