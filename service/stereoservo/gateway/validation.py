@@ -460,17 +460,21 @@ def check_step(target: StepTarget, context: GoalContext) -> list[str]:
         problems.append("target: exactly one of matrix, and of move or turn that are not zero, is valid")
     for key, values in {"move": target.move, "turn": target.turn, "matrix": target.matrix or ()}.items():
         if max(map(abs, values), default=0.0) > MAX_STEP:
-            problems.append(f"target.{key}: its largest number is {max(map(abs, values)):g}; up to {MAX_STEP:g} is valid")
+            problems.append(
+                f"target.{key}: its largest number is {max(map(abs, values)):g}; up to {MAX_STEP:g} is valid"
+            )
     angle = math.hypot(*target.turn)
     if angle > math.pi * (1.0 + ORTHONORMAL):
-        problems.append(f"target.turn: {math.degrees(angle):.6g}°; up to 180° is valid, make several steps of a larger one")
+        problems.append(
+            f"target.turn: {math.degrees(angle):.6g}°; up to 180° is valid, make several steps of a larger one"
+        )
     if target.matrix is not None:
         H = np.array(target.matrix).reshape(4, 4)
         off = max(float(np.abs(H[:3, :3].T @ H[:3, :3] - np.eye(3)).max()), float(np.abs(H[3] - (0, 0, 0, 1)).max()))
         if not off <= ORTHONORMAL or np.linalg.det(H[:3, :3]) < 0.0:
             problems.append(
-                f"target.matrix: is not rigid, by {off:.3g}; a rotation (3 x 3, determinant 1), a translation [m] and the "
-                "last row 0 0 0 1 are needed"
+                f"target.matrix: is not rigid, by {off:.3g}; a rotation (3 x 3, determinant 1), a translation [m] and "
+                "the last row 0 0 0 1 are needed"
             )
     return problems
 

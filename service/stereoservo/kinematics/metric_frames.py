@@ -64,8 +64,8 @@ def _axes_along(directions: FloatArray) -> FloatArray:
 
 
 class _Placed(NamedTuple):
-    """A frame in `framed_model`, at the model's zero: ``axes`` (3, 3) as columns, ``origin`` (3,); whether the arm's last
-    link carries it.
+    """A frame in `framed_model`, at the model's zero: ``axes`` (3, 3) as columns, ``origin`` (3,), and whether it is
+    ``carried`` by the arm's last link.
     """
 
     axes: FloatArray
@@ -78,15 +78,15 @@ def metric_frame(
 ) -> MetricFrame:
     """The frame ``name`` of a metric ``model``: ``tool``, ``base``, ``camera:NAME`` or ``scene:…``.
 
-    ``known``: the length that scales it; None: unscaled, for turns. ``scene`` (3, 4): the points of a scene frame in the
+    ``known``: the length that scales it; None: unscaled, for turns. ``scene`` (3, 4): points of a scene frame in the
     model's. ``centre``: ids of markers about whose middle a turn is made; empty: about the tool's origin. Raises
     ReadOutError (``stratum``, ``axes``, ``points``, ``unknown_name``, ``length``).
     """
     if model.stratum != "metric":
         raise ReadOutError(
             "stratum",
-            f"the model's stratum is {model.stratum!r}: lengths and angles are not known in it. A metric model is needed: "
-            "calibrate with joint axes of two directions or more",
+            f"the model's stratum is {model.stratum!r}: lengths and angles are not known in it. A metric model is "
+            "needed: calibrate with joint axes of two directions or more",
         )
     parts = framed_model(model)
     in_hand = model.mount == "eye_in_hand"
