@@ -67,7 +67,8 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
 
 def test_steps_are_read_in_their_units() -> None:
     step = step_tree(["z=+20mm", "x=-1.5cm"], ["y=10deg"], "base", "")
-    assert make_goal(step).target == StepTarget("base", (-0.015, 0.0, 0.02), (0.0, pytest.approx(math.radians(10)), 0.0))
+    turn = (0.0, pytest.approx(math.radians(10)), 0.0)
+    assert make_goal(step).target == StepTarget("base", (-0.015, 0.0, 0.02), turn)
     assert make_goal(step_tree(["x=.5m,y=1e-3m"], None, None, "a:j2=0.4")).target == StepTarget(
         "tool", (0.5, 0.001, 0.0), length="a:j2=0.4"
     )

@@ -103,9 +103,7 @@ def test_a_step_ends_where_it_does_by_the_true_axes_of_its_frame(
 
     move, turn = made(goal_q)
     rigid = pose(Rotation.from_rotvec(turn).as_matrix(), move)
-    step = (
-        StepTarget(frame, matrix=tuple(rigid.ravel())) if as_matrix else StepTarget(frame, tuple(move), tuple(turn))
-    )
+    step = StepTarget(frame, matrix=tuple(rigid.ravel())) if as_matrix else StepTarget(frame, tuple(move), tuple(turn))
     reply = bench.reply(bench.goal(stated(bench, step), law=law, gain=4.0))
     assert reply.accepted, reply
     event = bench.ended()
@@ -139,7 +137,8 @@ def test_a_turn_is_made_about_the_centre_and_needs_no_length(bench: Any) -> None
     before = bench.truth.points(bench.q)
     assert bench.reply(bench.goal(target, centre=Centre(markers=(0,)))).accepted
     event = bench.ended()
-    assert re.search(r"in base: asked \(0.00, 0.00, 5.73\)°; made \(-?0.0\d, -?0.0\d, 5.[5-9]\d\)°$", event.message), event
+    said = r"in base: asked \(0.00, 0.00, 5.73\)°; made \(-?0.0\d, -?0.0\d, 5.[5-9]\d\)°$"
+    assert re.search(said, event.message), event
     apart = np.linalg.norm(bench.truth.points(bench.q) - before, axis=1)
     assert apart[0] < 6e-4  # as above
     assert abs(apart[2] - 2 * np.sin(0.05) * np.linalg.norm((before[2] - before[0])[:2])) < 6e-4
