@@ -204,7 +204,7 @@ def test_every_law_takes_every_target_that_fixes_a_pose(law: Any) -> None:
         (DisplacementTarget((1e308,) * 16, 1), "matrix: its largest number is 1e+308; 1e-100 to 1e+100 is valid"),
         (DisplacementTarget((0.0,) * 16, 1), "matrix: is singular (singular values 0, 0, 0, 0)"),
         (DisplacementTarget(MIRROR, 1), "determinant is negative, which makes a mirror image"),
-        (DisplacementTarget(EYE, 1, None, MetricFrame("tool", EYE, True, (0, 0, 0), True)), "kind 'step' with the name"),
+        (DisplacementTarget(EYE, 1, None, MetricFrame("tool", EYE, True, (0, 0, 0), True)), "kind 'step' with the"),
         (StepTarget(move=(0.0, 0.0, 0.0)), "exactly one of matrix, and of move or turn"),
         (StepTarget(move=(0.0, 0.0, 1.0), matrix=EYE), "exactly one of matrix, and of move or turn"),
         (StepTarget("hand", (0.0, 0.0, 1.0)), "no frame 'hand'; valid: tool, base, camera:left, camera:right, and"),
