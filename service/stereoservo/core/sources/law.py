@@ -419,10 +419,13 @@ def _ended(
             return SourceOutput(
                 np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(source.apart,)
             )
-        made, arrays, target = "", context.arrays, source.goal.target
-        if source.step_from is not None and arrays is not None and isinstance(target, DisplacementTarget):
-            made = "; " + step_made(target, arrays, source.step_from, context.q + context.state.block.correction)
-        context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px{made}", error_px=error_px)
+        message = f"error {error_px:.4f} px"
+        if isinstance(source, ServoGoal) and source.step_from is not None:
+            assert context.arrays is not None
+            assert isinstance(source.goal.target, DisplacementTarget)
+            now = context.q + context.state.block.correction
+            message += "; " + step_made(source.goal.target, context.arrays, source.step_from, now)
+        context.emit("goal_reached", id=source.goal.id, message=message, error_px=error_px)
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
 
