@@ -110,6 +110,8 @@ def _placed(model: CellModel, parts: FramedModel, name: str, scene: FloatArray |
     in_hand = model.mount == "eye_in_hand"
     if name.startswith("camera:"):
         cameras = [f"camera:{camera.name}" for camera in model.cameras]
+        if name not in cameras:
+            raise ReadOutError("unknown_name", f"the model has no {name}; it has {', '.join(cameras)}: calibrate again")
         _, R, t = decompose_camera(parts.cameras[cameras.index(name)])
         return _Placed(R.T, -R.T @ t, in_hand)
     if scene is not None:

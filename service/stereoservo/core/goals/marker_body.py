@@ -167,7 +167,7 @@ def step_made(target: DisplacementTarget, arrays: ModelArrays, start: FloatArray
 
 
 def _three(values: FloatArray) -> str:
-    return f"({', '.join(f'{value:.2f}' for value in values + 0.0)})"
+    return f"({', '.join(f'{round(float(value), 2) + 0.0:.2f}' for value in values)})"
 
 
 def _frame_at(frame: MetricFrame, arrays: ModelArrays, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
