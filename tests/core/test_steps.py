@@ -112,8 +112,8 @@ def test_a_step_ends_where_it_does_by_the_true_axes_of_its_frame(
     asked, measured = event.message.split("asked ")[1].split("; made ")
     for text, true in (asked, (move, turn)), (measured, made(bench.q)):
         for part, exact in zip(text.split(" mm, "), (1e3 * true[0], np.degrees(true[1])), strict=True):
-            told = [float(number) for number in part.strip("()°").split(",")]
-            assert np.abs(told - exact).max() < 0.006  # its last decimal
+            stated_values = [float(number) for number in part.strip("()°").split(",")]
+            assert np.abs(np.array(stated_values) - exact).max() < 0.006  # its last decimal
 
 
 def test_a_queued_step_is_made_in_the_frame_where_the_goal_before_it_ends(benches: Any) -> None:

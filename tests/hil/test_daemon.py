@@ -183,6 +183,8 @@ def test_a_step_is_refused_without_a_length_and_made_with_one(
     assert listed.goal.target.set_points  # type: ignore[union-attr]
     made = handle.reached(60.0).message.split("in base: asked (0.00, 0.00, 10.00) mm, (0.00, 0.00, 0.00)°; made ")[1]
     assert np.abs(np.array(made.split(")")[0].strip("(").split(","), dtype=float) - (0.0, 0.0, 10.0)).max() < 1.0
+    both = ["goal", CELL, "--move", "x=2mm,z=-5mm", "--turn", "z=2deg", "--length", LENGTH, "--check"]
+    assert cli.invoke(both) == 0
     turned = ["goal", CELL, "--turn", "z=-5deg", "--in", "camera:left", "--law", "trajectory"]
     assert cli.invoke(turned) == 0
     assert "in camera:left: asked (0.00, 0.00, -5.00)°; made (" in capfd.readouterr().out
