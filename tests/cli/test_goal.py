@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,7 +13,7 @@ from typing import Any
 import pytest
 
 from stereoservo.cli import goal as goal_command
-from stereoservo.cli.goal import adaptive, make_goal, plan_table, stream_lines, target_tree
+from stereoservo.cli.goal import adaptive, make_goal, plan_table, step_tree, stream_lines, target_tree
 from stereoservo.cli.main import invoke
 from stereoservo.cli.output import CommandError
 from stereoservo.cli.status import progress_words
@@ -25,6 +26,7 @@ from stereoservo.messages.goals import (
     IncidenceTarget,
     PlanReport,
     PointTarget,
+    StepTarget,
     TaughtTarget,
 )
 from stereoservo.messages.wire import MessageError
@@ -57,14 +59,30 @@ def test_targets_come_from_files(tmp_path: Path) -> None:
     spec = {"kind": "point-on-point", "moving": {"markers": [0]}, "fixed": hole}
     found = made(tmp_path, "incidence", {"incidences": [spec], "model_epoch": 1})
     assert isinstance(found, IncidenceTarget)
+    found = made(tmp_path, "displacement", {"matrix": EYE, "frame": "base"})
+    assert found == StepTarget("base", matrix=FLAT)
     taught = target_tree("pick", None, None, {}, "workpiece", "10,11,12")
     assert make_goal(taught).target == TaughtTarget("pick", "workpiece", (10, 11, 12))
+
+
+def test_steps_are_read_in_their_units() -> None:
+    step = step_tree(["z=+20mm", "x=-1.5cm"], ["y=10deg"], "base", "")
+    turn = (0.0, pytest.approx(math.radians(10)), 0.0)
+    assert make_goal(step).target == StepTarget("base", (-0.015, 0.0, 0.02), turn)
+    assert make_goal(step_tree(["x=.5m,y=1e-3m"], None, None, "a:j2=0.4")).target == StepTarget(
+        "tool", (0.5, 0.001, 0.0), length="a:j2=0.4"
+    )
+    for move, turn in ((["z=20"], None), (["z=20deg"], None), (["z=1mm", "z=2mm"], None), (None, ["w=3deg"])):
+        with pytest.raises(CommandError, match="each of x, y, z at most once, a number and a unit"):
+            step_tree(move, turn, None, "")
 
 
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
         (("pick", "--points", "predicted"), "one of NAME"),
+        (("pick", "--move", "z=1mm"), "one of NAME"),
+        (("pick", "--in", "base"), "--in and --length go with --move or --turn"),
         (("--points", "predicted"), "--points takes a file; predicted goes with --point-source"),
         (
             ("--joint", "j1=0", "--relative-to", "workpiece"),

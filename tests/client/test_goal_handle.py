@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from stereoservo.client import Client, ClientError, GoalHandle, GoalProgress
-from stereoservo.messages.goals import AdaptiveGain, Centre, FeatureTarget, Goal, JointTarget, TaughtTarget
+from stereoservo.messages.goals import AdaptiveGain, Centre, FeatureTarget, Goal, JointTarget, StepTarget, TaughtTarget
 from stereoservo.messages.reasons import Reason
-from stereoservo.messages.wire import EventMessage, LoopInfo, MessageError, Reply, StateMessage
+from stereoservo.messages.wire import EventMessage, LoopInfo, MessageError, Reply, StateMessage, decode, encode
 
 ID = "12345678-aaaa"
 TARGET = FeatureTarget({"left": {0: (1.0, 2.0)}})
@@ -138,3 +138,23 @@ def test_goals_are_made_from_shorthands_and_strictly() -> None:
     with pytest.raises(MessageError, match="unknown field `hurry`"):
         Client.make_goal(TARGET, hurry=True)  # type: ignore[call-arg]
     assert msgspec.json.encode(goal)
+
+
+def test_steps_are_goals_in_metres_and_radians() -> None:
+    sent: list[tuple[Any, dict[str, Any]]] = []
+
+    class Sender(Client):
+        def __init__(self) -> None: ...
+
+        def goal(self, target: Any, **options: Any) -> Any:
+            sent.append((target, options))
+
+    Sender().move(z=0.02, frame="base", length="markers:0,1=0.05", law="trajectory")
+    Sender().turn(x=0.1)
+    assert sent == [
+        (StepTarget("base", (0.0, 0.0, 0.02), length="markers:0,1=0.05"), {"law": "trajectory"}),
+        (StepTarget("tool", turn=(0.1, 0.0, 0.0)), {}),
+    ]
+    for step, _ in sent:
+        goal = Client.make_goal(step)
+        assert decode(encode(goal), Goal) == goal

@@ -13,15 +13,19 @@ from stereoservo.gateway.publisher import EventLog
 from stereoservo.gateway.validation import GoalContext
 from stereoservo.messages.goals import (
     AcknowledgeGoal,
+    Centre,
     Command,
+    DisplacementTarget,
     FeatureTarget,
     Goal,
     Hold,
     IncidenceTarget,
     JointTarget,
+    MetricFrame,
     PlanReport,
     RenewGoal,
     RunGoal,
+    StepTarget,
     TaughtTarget,
     Teach,
     UpdateGoal,
@@ -31,6 +35,7 @@ from stereoservo.messages.wire import Reply, encode
 
 ID = "12345678-aaaa"
 KEYS = KeySpace("demo")
+EYE = tuple(float(i % 5 == 0) for i in range(16))
 POINTS = {"left": {0: (10.0, 10.0), 1: (20.0, 10.0), 2: (20.0, 20.0)}}
 
 
@@ -89,6 +94,10 @@ class StubTeaching:
         self, target: IncidenceTarget, follow: tuple[int, ...]
     ) -> tuple[IncidenceTarget, dict[str, dict[int, tuple[float, float]]]]:
         return target, {}
+
+    def resolve_step(self, step: StepTarget, centre: Centre | None) -> TransferredGoal:
+        frame = MetricFrame(step.frame, EYE, True, (0.0, 0.0, 0.0), True)
+        return TransferredGoal(DisplacementTarget(EYE, 7, frame=frame), "scaled by markers of 0, 1, 0.05 m")
 
     def expect(self, request: int, tool: tuple[int, ...]) -> None:
         self.expected.append((request, tool))
@@ -361,3 +370,17 @@ def test_a_flood_of_refused_puts_is_a_few_events_with_the_number_of_the_rest(
     now += 60.0
     bench.intake.goal_sample(Message(KEYS.goal("anna"), b"{"))
     assert len(bench.kinds()) == len(messages) + 1
+
+
+def test_a_step_goes_to_the_core_in_its_frame_and_is_listed_as_set_points_that_former_clients_read(
+    bench: Bench,
+) -> None:
+    bench.goal(Goal(ID, StepTarget("base", (0.0, 0.0, 0.02))))
+    ((command, _),) = bench.link.asked
+    assert isinstance(command, RunGoal)
+    assert command.goal.target.frame.name == "base"  # type: ignore[union-attr]
+    pixels = {"left": {0: ((10.0, 10.0), (12.0, 11.0)), 1: ()}}
+    bench.answer(1, True, "accepted", PlanReport("cartesian3", "straight", 1.0, (), (0.0, 1.0), {}, pixels))
+    assert bench.replies.sent[0][1].message == "accepted; scaled by markers of 0, 1, 0.05 m"
+    (running,) = bench.intake.running().goals
+    assert running.goal.target == FeatureTarget({"left": {0: (12.0, 11.0)}}, 7)

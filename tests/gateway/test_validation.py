@@ -26,8 +26,10 @@ from stereoservo.messages.goals import (
     IncidenceTarget,
     Jog,
     JointTarget,
+    MetricFrame,
     OrderAuxiliary,
     PointTarget,
+    StepTarget,
     TaughtTarget,
     Teach,
     UpdateGoal,
@@ -158,6 +160,8 @@ ALL_KINDS: list[Any] = [
     PointTarget(POINTS, 1),
     DisplacementTarget(EYE, model_epoch=1),
     DisplacementTarget(EYE, basis=(0, 1, 2, 3, 4)),
+    StepTarget("camera:left", (0.0, 0.0, 0.02), (0.1, 0.0, 0.0), length="markers:0,1=0.05"),
+    StepTarget("scene:6-7-8", matrix=EYE),
     TaughtTarget("park", "workpiece", (6, 7, 8, 9, 10)),
     TaughtTarget("park", "cameras"),
     JointTarget({"j1": 0.5}),
@@ -179,7 +183,7 @@ def test_every_kind_of_goal_may_be_good_and_survives_the_wire(target: Any) -> No
 
 @pytest.mark.parametrize("law", LAWS)
 def test_every_law_takes_every_target_that_fixes_a_pose(law: Any) -> None:
-    for target in ALL_KINDS[:6]:
+    for target in ALL_KINDS[:8]:
         assert check_goal(Goal("12345678", target, law=law), RICH) == []
 
 
@@ -200,6 +204,16 @@ def test_every_law_takes_every_target_that_fixes_a_pose(law: Any) -> None:
         (DisplacementTarget((1e308,) * 16, 1), "matrix: its largest number is 1e+308; 1e-100 to 1e+100 is valid"),
         (DisplacementTarget((0.0,) * 16, 1), "matrix: is singular (singular values 0, 0, 0, 0)"),
         (DisplacementTarget(MIRROR, 1), "determinant is negative, which makes a mirror image"),
+        (DisplacementTarget(EYE, 1, None, MetricFrame("tool", EYE, True, (0, 0, 0), True)), "kind 'step' with the"),
+        (StepTarget(move=(0.0, 0.0, 0.0)), "exactly one of matrix, and of move or turn"),
+        (StepTarget(move=(0.0, 0.0, 1.0), matrix=EYE), "exactly one of matrix, and of move or turn"),
+        (StepTarget("hand", (0.0, 0.0, 1.0)), "no frame 'hand'; valid: tool, base, camera:left, camera:right, and"),
+        (StepTarget("scene:0-6-7", (0.0, 0.0, 1.0)), "0 is of the marker body itself"),
+        (StepTarget("base", (0.0, 0.0, 1.0), length="plate=5"), "length: 'plate=5' is no known length; WHAT:OF"),
+        (StepTarget("base", (0.0, 0.0, 101.0)), "move: its largest number is 101; up to 100 is valid"),
+        (StepTarget("base", turn=(0.0, 3.0, 3.0)), "turn: 243.085°; up to 180° is valid"),
+        (StepTarget("base", matrix=MIRROR), "matrix: is not rigid, by 0; a rotation (3 x 3, determinant 1)"),
+        (StepTarget("base", matrix=tuple(2.0 * x for x in EYE)), "matrix: is not rigid, by 3"),
         (TaughtTarget("park", None, (6, 7, 8)), "common: 6, 7, 8 belongs to relative_to"),
         (TaughtTarget("park", "workpiece", (6, 7)), "2 marker(s) (6, 7); 5 are needed, with a metric model 3"),
         (TaughtTarget("park", "workpiece", (6, 7, 8, 0)), "0 is of the marker body itself; markers beside it: 6"),

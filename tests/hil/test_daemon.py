@@ -168,7 +168,26 @@ def joints_of(client: Client) -> FloatArray:
     return np.array(list(client.status().joints.values()))
 
 
+LENGTH = "baseline:left,right=0.3"
 OFFSET = np.array([0.06, -0.04, 0.05, 0.05, -0.04, 0.06])
+
+
+def test_a_step_is_refused_without_a_length_and_made_with_one(
+    client: Client, capfd: pytest.CaptureFixture[str]
+) -> None:
+    client.goal("park", law="cartesian3", tolerance_px=0.5, hold_frames=3).reached(60.0)
+    with pytest.raises(RefusedError, match="turning joints alone leave the model's scale open, and no length is known"):
+        client.move(z=0.01)
+    handle = client.move(z=0.01, frame="base", length=LENGTH, law="trajectory", tolerance_px=0.1)
+    (listed,) = client.running_goals()
+    assert listed.goal.target.set_points  # type: ignore[union-attr]
+    made = handle.reached(60.0).message.split("in base: asked (0.00, 0.00, 10.00) mm, (0.00, 0.00, 0.00)°; made ")[1]
+    assert np.abs(np.array(made.split(")")[0].strip("(").split(","), dtype=float) - (0.0, 0.0, 10.0)).max() < 1.0
+    both = ["goal", CELL, "--move", "x=2mm,z=-5mm", "--turn", "z=2deg", "--length", LENGTH, "--check"]
+    assert cli.invoke(both) == 0
+    turned = ["goal", CELL, "--turn", "z=-5deg", "--in", "camera:left", "--law", "trajectory"]
+    assert cli.invoke(turned) == 0
+    assert "in camera:left: asked (0.00, 0.00, -5.00)°; made (" in capfd.readouterr().out
 
 
 def test_a_displacement_is_checked_driven_streamed_and_acknowledged(client: Client, tmp_path: Path) -> None:

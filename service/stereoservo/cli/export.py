@@ -22,11 +22,11 @@ from stereoservo.core.cycle import Status, StepInputs, StepOutputs
 from stereoservo.core.settings import CoreSettings
 from stereoservo.geometry.homogeneous import GeometryError
 from stereoservo.kinematics.denavit_hartenberg import DH_HEADER, ReadOutError, denavit_hartenberg, dh_cells
+from stereoservo.kinematics.metric_frames import scale_length
 from stereoservo.kinematics.model import CellModel, load_model
 from stereoservo.kinematics.urdf import metric_arm, urdf_text
-from stereoservo.messages.cell_file import CellFile, load_cell_file
+from stereoservo.messages.cell_file import load_cell_file
 from stereoservo.messages.goals import RunGoal
-from stereoservo.messages.known_length import KnownLength, known_length_of
 from stereoservo.messages.recording_request import images_directory
 from stereoservo.ports.image_files import ImageReader
 from stereoservo.recording.compression import Checkpoints, StepBlocks
@@ -183,10 +183,12 @@ def _export_flight(file: Path, target: Path, json: bool) -> None:
 def _export_model(file: Path, urdf: Path | None, dh: bool, length: str, cell_path: Path | None, json: bool) -> None:
     model = load_model(file)
     cell = None if cell_path is None else load_cell_file(cell_path)
-    known = _known_length(length, model, cell)
-    told: dict[str, Any] = {"joints": list(model.joint_names), "known": known}
-    lines = [f"scaled by {known.what} of {', '.join(str(name) for name in known.of)}, {known.metres:g} m"]
+    if cell is not None and cell.calibration is not None:
+        length = length or cell.calibration.known_length
     try:
+        known = scale_length(model, length)
+        told: dict[str, Any] = {"joints": list(model.joint_names), "known": known}
+        lines = [f"scaled by {known.what} of {', '.join(str(name) for name in known.of)}, {known.metres:g} m"]
         if dh:
             rows = denavit_hartenberg(model, known)
             told["denavit_hartenberg"] = msgspec.to_builtins(rows)
@@ -220,27 +222,6 @@ def _words(one: Evidence, model: CellModel) -> str:
         else f"chi-square {one.chi2:.1f} of {one.freedom}, up to {one.threshold:.1f}"
     )
     return f"axes of {', '.join(first)} and {last} {how}, by the model's covariance: {held}"
-
-
-def _known_length(text: str, model: CellModel, cell: CellFile | None) -> KnownLength:
-    """The known length, from ``text`` or else the cell file; by default the unit of the first prismatic joint. Raises
-    CommandError.
-    """
-    if not text and cell is not None and cell.calibration is not None:
-        text = cell.calibration.known_length
-    slides = [n for n, kind in zip(model.joint_names, model.joint_kinds, strict=True) if kind == "prismatic"]
-    if not text and slides:
-        return KnownLength("prismatic", (slides[0],), 1.0)
-    if not text:
-        raise CommandError(
-            "length",
-            "turning joints alone leave the model's scale open: --length WHAT:OF=METRES is needed, markers:10,11=0.05 "
-            "say, or calibration.known_length in the cell file and --cell FILE",
-        )
-    try:
-        return known_length_of(text)
-    except ValueError as error:
-        raise CommandError("length", str(error)) from error
 
 
 # -- flights -------------------------------------------------------------------------------------------------

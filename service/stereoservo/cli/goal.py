@@ -4,6 +4,8 @@ it, prints its plan and progress, and waits for its end.
 
 from __future__ import annotations
 
+import math
+import re
 import sys
 import time
 import uuid
@@ -44,6 +46,8 @@ if TYPE_CHECKING:
 
 KINDS = {"points": "points", "displacement": "displacement", "incidence": "incidence"}
 """Options that take a target as a file, and its kind."""
+UNITS = {"--move": {"mm": 1e-3, "cm": 1e-2, "m": 1.0}, "--turn": {"deg": math.pi / 180.0, "rad": 1.0}}
+"""Units of a step's components, in [m] and [rad]."""
 SOURCES = ("triangulated", "predicted")
 PLANNED_LAW = "trajectory"
 """Law whose plan can end in a chosen posture."""
@@ -69,14 +73,17 @@ def target_tree(
     common: str | None,
     lines: str | None = None,
     planes: str | None = None,
+    step: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The target in wire format. Exactly one of a name, joints, set-points or a file of ``files`` must be given."""
-    given = [bool(name), bool(joints), set_points is not None, *(path is not None for path in files.values())]
+    """The target in wire format. Exactly one of a name, joints, set-points, a ``step`` or a file of ``files`` must be
+    given.
+    """
+    given = [bool(name), bool(joints), set_points is not None, bool(step), *(f is not None for f in files.values())]
     if sum(given) != 1:
         raise CommandError(
             "usage",
-            "one of NAME (a taught goal), --joint, --set-points, --images, --points, --displacement, --incidence, "
-            "--follow or --file is needed",
+            "one of NAME (a taught goal), --move or --turn, --joint, --set-points, --images, --points, --displacement, "
+            "--incidence, --follow or --file is needed",
         )
     if (relative_to or common or lines or planes) and not name:
         raise CommandError("usage", "--relative-to, --common, --lines and --planes go with NAME, a taught goal")
@@ -90,6 +97,8 @@ def target_tree(
             if text is not None:
                 tree[key] = _id_groups(text, f"--{key}", least, most)
         return tree
+    if step:
+        return step
     if joints:
         return {"kind": "joints", "positions": pairs(joints, "--joint")}
     if set_points is not None:
@@ -98,12 +107,38 @@ def target_tree(
     if kind == "points" and str(path) in SOURCES:
         raise CommandError("usage", f"--points takes a file; {path} goes with --point-source")
     tree = read_object(path)
-    if tree.get("kind", KINDS[kind]) != KINDS[kind]:
-        raise CommandError("file", f"{path}: kind is {tree['kind']!r}; {KINDS[kind]!r} goes with --{kind}")
+    valid = "step" if kind == "displacement" and "frame" in tree else KINDS[kind]
+    if tree.get("kind", valid) != valid:
+        raise CommandError("file", f"{path}: kind is {tree['kind']!r}; {valid!r} goes with --{kind}")
     matrix = tree.get("matrix")
     if kind == "displacement" and isinstance(matrix, list) and all(isinstance(row, list) for row in matrix):
         tree["matrix"] = [number for row in matrix for number in row]
-    return {**tree, "kind": KINDS[kind]}
+    return {**tree, "kind": valid}
+
+
+def step_tree(move: list[str] | None, turn: list[str] | None, frame: str | None, length: str) -> dict[str, Any]:
+    """A step as a target in wire format, from ``z=+20mm`` and ``z=+10deg``; empty without one. Raises CommandError."""
+    if not (move or turn):
+        if frame or length:
+            raise CommandError("usage", "--in and --length go with --move or --turn")
+        return {}
+    vectors = {"move": _along_axes(move, "--move", "z=+20mm"), "turn": _along_axes(turn, "--turn", "z=+10deg")}
+    return {"kind": "step", "frame": frame or "tool", "length": length, **vectors}
+
+
+def _along_axes(texts: list[str] | None, option: str, example: str) -> list[float]:
+    """Components x, y, z [m or rad] of ``AXIS=NUMBER UNIT``, repeated or with commas; others are 0."""
+    units, found = UNITS[option], dict.fromkeys("xyz", 0.0)
+    for text in ",".join(texts or ()).split(",") if texts else ():
+        match = re.fullmatch(r"([xyz])=([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?) ?([a-z°]+)", text.strip())
+        if match is None or match[3] not in units or found[match[1]]:
+            raise CommandError(
+                "argument",
+                f"{option} {text!r}: each of x, y, z at most once, a number and a unit ({', '.join(units)}) are valid, "
+                f"{example} say",
+            )
+        found[match[1]] = float(match[2]) * units[match[3]]
+    return list(found.values())
 
 
 def _id_groups(text: str, what: str, least: int, most: int) -> list[list[int]]:
@@ -236,7 +271,7 @@ Stream = Iterator[tuple[float | None, StreamedTarget]]
 WAITING_LEASE_S = 2.0
 """The process that waits for a goal renews its lease: when it dies, the arm stops."""
 
-TARGETS = ("file", "name", "joint", "set_points", "points", "displacement", "incidence")
+TARGETS = ("file", "name", "move", "turn", "joint", "set_points", "points", "displacement", "incidence")
 """Options that are a target, without those of streams and images."""
 FOR_POSTURES = ("taught", "features")
 """Kinds of targets whose postures are listed."""
@@ -264,6 +299,24 @@ class GoalOptions:
         str | None,
         typer.Option(metavar="A-B-C,...", help="Faces, each by ids of points on it; others then than now will do."),
     ] = None
+    move: Annotated[
+        list[str] | None,
+        typer.Option("--move", metavar="AXIS=LENGTH", help="Move along an axis of --in: z=+20mm; repeatable."),
+    ] = None
+    turn: Annotated[
+        list[str] | None,
+        typer.Option("--turn", metavar="AXIS=ANGLE", help="Turn about an axis of --in, at the middle of the markers."),
+    ] = None
+    in_frame: Annotated[
+        str | None,
+        typer.Option("--in", metavar="FRAME", help="tool (default), base, camera:NAME, or scene:A-B-C by three ids."),
+    ] = None
+    length: Annotated[
+        str,
+        typer.Option(
+            metavar="WHAT:OF=METRES", help="For --move: a known length, markers:10,11=0.05 (default: the cell's)."
+        ),
+    ] = ""
     joint: Annotated[
         list[str] | None, typer.Option("--joint", metavar="NAME=RAD", help="Joint position [rad or m]; repeatable.")
     ] = None
@@ -288,7 +341,9 @@ class GoalOptions:
     displacement: Annotated[
         Path | None,
         typer.Option(
-            "--displacement", metavar="FILE", help='JSON: {"matrix": 4x4, "model_epoch": N or "basis": 5 ids}.'
+            "--displacement",
+            metavar="FILE",
+            help='JSON: {"matrix": 4x4 rigid [m], "frame": as --in}, or projective, "model_epoch" or "basis": 5 ids.',
         ),
     ] = None
     incidence: Annotated[
@@ -387,7 +442,8 @@ def goal(cell: CellArgument, given: GoalOptions = GOAL_OPTIONS, options: CellOpt
     elif given.file is None:
         files = {"points": given.points, "displacement": given.displacement, "incidence": given.incidence}
         relative = (given.relative_to, given.common, given.lines, given.planes)
-        target = target_tree(given.name, given.joint, given.set_points, files, *relative)
+        step = step_tree(given.move, given.turn, given.in_frame, given.length)
+        target = target_tree(given.name, given.joint, given.set_points, files, *relative, step)
     local = target if given.file is None and stream is None and options.endpoint is None else {}
     ends_in = None if given.posture is None else _ends_in(cell, local, given.posture, options.operator)
     requested = (
@@ -480,7 +536,8 @@ def follow(handle: GoalHandle, as_json: bool, cell: str) -> None:
         tree = cast("dict[str, Any]", msgspec.to_builtins(result))
         raise CommandError("goal_" + result.outcome, f"goal {result.outcome}: {result.why}", goal=tree)
     error = "" if result.error_px is None else f", error {result.error_px:.3f} px"
-    emit(result, f"reached in {result.seconds:.2f} s{error}", as_json)
+    _, _, made = result.message.partition("; ")
+    emit(result, f"reached in {result.seconds:.2f} s{error}" + (f"\n{made}" if made else ""), as_json)
 
 
 def plan_table(plan: PlanReport) -> str:

@@ -40,6 +40,7 @@ from stereoservo.messages.goals import (
     ProfileName,
     Reset,
     Resume,
+    StepTarget,
     Stop,
     Target,
     TaughtTarget,
@@ -195,6 +196,37 @@ class Client(Connection):
         """
         options.setdefault("lease_s", 5.0)
         return self.send(self.make_goal(target, **options))
+
+    def move(
+        self,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        *,
+        frame: str = "tool",
+        length: str = "",
+        **options: Unpack[GoalOptions],
+    ) -> GoalHandle:
+        """Move what the arm carries by ``x``, ``y``, ``z`` [m] along the axes of ``frame``: ``tool``, ``base``,
+        ``camera:NAME`` or ``scene:A-B-C``.
+
+        ``length``: a known length, ``markers:10,11=0.05`` say, if the cell states none. Raises as :meth:`goal`.
+        """
+        return self.goal(StepTarget(frame, move=(x, y, z), length=length), **options)
+
+    def turn(
+        self,
+        x: float = 0.0,
+        y: float = 0.0,
+        z: float = 0.0,
+        *,
+        frame: str = "tool",
+        **options: Unpack[GoalOptions],
+    ) -> GoalHandle:
+        """Turn what the arm carries by the rotation vector ``x``, ``y``, ``z`` [rad] in the axes of ``frame``, as in
+        :meth:`move`, about the middle of the markers or the option ``centre``. Raises as :meth:`goal`.
+        """
+        return self.goal(StepTarget(frame, turn=(x, y, z)), **options)
 
     @staticmethod
     def make_goal(target: Target | str | Mapping[str, Any], **options: Unpack[GoalOptions]) -> Goal:

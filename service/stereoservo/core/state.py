@@ -182,7 +182,8 @@ class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
     the point ``centre_body`` (4,) of the body at the chain's zero; ``centre_target`` (4,): the centre at the goal.
     ``stream``: of a moving goal, once a client has moved it.
     ``plan``: path of a planned law, for a body that was at ``start_points`` (m, 4); ``plan_s``: current time on it.
-    ``goal_joints`` (n,): joints at the end of a plan.
+    ``goal_joints`` (n,): joints at the end of a plan. ``step_from`` (n,): corrected joints at the start of a step in a
+    metric frame; None for other goals.
     """
 
     law: str
@@ -204,6 +205,7 @@ class ServoGoal(LawRun, tag="law", eq=False, kw_only=True):
     start_points: FloatArray | None = None
     goal_joints: FloatArray | None = None
     followed: Followed | None = None
+    step_from: FloatArray | None = None
 
 
 class IncidenceGoal(LawRun, tag="incidence", eq=False, kw_only=True):

@@ -1,4 +1,5 @@
-"""Set-points of taught goals, reprojected for a moved workpiece, other cameras or a remounted marker body (thesis 8.6).
+"""Set-points of taught goals, reprojected for a moved workpiece, other cameras or a remounted marker body (thesis 8.6);
+and steps in a person's frames as displacements.
 
 A goal stores the pixels of the moving body (or of a tool on it), of the workpiece, and the cameras that saw them. The
 ``common`` markers, which are static relative to the goal, determine the map from the frame of teaching to the current
@@ -9,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from stereoservo.daemon.taught_goals import TaughtGoal, TaughtModel
@@ -33,12 +35,15 @@ from stereoservo.gateway.point_alignment import (
 from stereoservo.gateway.validation import listed
 from stereoservo.geometry.alignment import POINTS_NEEDED, AlignmentFrame, family_between
 from stereoservo.geometry.cameras import project_many
-from stereoservo.geometry.homogeneous import move_points
+from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import FrameChange, carried_point_covariance
 from stereoservo.kinematics.chain import ProjectiveChain
+from stereoservo.kinematics.denavit_hartenberg import ReadOutError
+from stereoservo.kinematics.metric_frames import metric_frame, scale_length
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import FeatureTarget, TaughtTarget
+from stereoservo.messages.goals import Centre, DisplacementTarget, FeatureTarget, StepTarget, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
+from stereoservo.planning.motion_frame import axis_rotation
 
 MOUNTED_PX = 5.0
 """Tolerance within which goal and kinematics agree if only cameras changed; otherwise the body was remounted."""
@@ -46,9 +51,9 @@ MOUNTED_PX = 5.0
 
 @dataclass(frozen=True)
 class TransferredGoal:
-    """Set-points for the model in use, with a description of their origin and accuracy."""
+    """Set-points for the model in use, or a step in its frame, with a description of their origin and accuracy."""
 
-    target: FeatureTarget
+    target: FeatureTarget | DisplacementTarget
     note: str
 
 
@@ -89,6 +94,55 @@ def resolve(
     elif not goal.tool and not same:
         note += f"; this holds if the marker body has not been remounted since model epoch {goal.model.epoch}"
     return TransferredGoal(FeatureTarget(set_points, model.epoch), f"{origin}; {note}")
+
+
+def resolve_step(
+    step: StepTarget, centre: Centre | None, model: CellModel | None, observations: MarkerObservations, length: str
+) -> TransferredGoal:
+    """A step as a rigid displacement in the frame that it names, scaled by its own length, else the cell's ``length``.
+
+    ``centre``: of the goal; a turn is made about it. Raises TransferError.
+    """
+    if model is None:
+        raise TransferError("the cell has no model yet: calibrate first")
+    ids = () if centre is None else centre.markers
+    if any(step.turn) and centre is not None and centre.point is not None:
+        raise TransferError("a turn is made about the middle of markers: give the centre by markers, not by a point")
+    matrix = np.eye(4) if step.matrix is None else np.array(step.matrix).reshape(4, 4)
+    if step.matrix is None:
+        angle = float(np.linalg.norm(step.turn))
+        matrix[:3, :3] = axis_rotation(np.array(step.turn) / (angle or 1.0), angle)
+        matrix[:3, 3] = step.move
+    scene = None
+    if step.frame.startswith("scene:"):
+        scene = _scene_points([int(marker) for marker in step.frame[6:].split("-")], model, observations)
+    text = step.length or length
+    try:
+        known = scale_length(model, text) if text or matrix[:3, 3].any() else None
+        frame = metric_frame(model, step.frame, known, scene, ids)
+    except (ReadOutError, GeometryError) as error:
+        raise TransferError(str(error)) from error
+    if step.matrix is not None:  # in the frame's own coordinates
+        frame = msgspec.structs.replace(frame, pivot=(0.0, 0.0, 0.0), pivot_with_body=frame.with_body)
+    scaled = "" if known is None else f", scaled by {known.what} of {listed(known.of)}, {known.metres:g} m"
+    target = DisplacementTarget(tuple(matrix.ravel().tolist()), model.epoch, frame=frame)
+    return TransferredGoal(target, f"a step in {step.frame}{scaled}")
+
+
+def _scene_points(markers: list[int], model: CellModel, observations: MarkerObservations) -> FloatArray:
+    """Points (3, 4) in the model's frame of ``markers`` that do not move with the arm. Raises TransferError."""
+    if model.mount == "eye_in_hand":
+        raise TransferError("the cameras ride on the arm: tool, base and camera:NAME are valid frames there")
+    require_still(observations, markers, "markers")
+    points, _ = observed_views(observations, model, markers).points()
+    unknown = [marker for marker, point in zip(markers, points, strict=True) if not np.isfinite(point).all()]
+    if unknown:
+        seen = {marker for shown in observations.values() for marker in shown} - set(model.marker_ids)
+        raise TransferError(
+            f"markers {listed(unknown)} of the scene are not seen by two cameras now; beside the body are seen: "
+            f"{listed(sorted(seen))}"
+        )
+    return points
 
 
 def _recorded_pixels(goal: TaughtGoal, model: CellModel | None) -> TransferredGoal:

@@ -33,11 +33,15 @@ from stereoservo.messages.goals import (
     AcknowledgeGoal,
     CancelGoal,
     Command,
+    DisplacementTarget,
+    FeatureTarget,
     Goal,
     IncidenceTarget,
+    PlanReport,
     RenewGoal,
     Reset,
     RunGoal,
+    StepTarget,
     Stop,
     TaughtTarget,
     Teach,
@@ -174,6 +178,10 @@ class Intake:
             if isinstance(goal.target, IncidenceTarget):
                 target, seen = self._teaching.resolve_incidence(goal.target, ids)
                 return msgspec.structs.replace(goal, target=target, follow_seen=goal.follow_seen or seen)
+            if isinstance(goal.target, StepTarget):
+                step = self._teaching.resolve_step(goal.target, goal.centre)
+                self._note = step.note
+                return msgspec.structs.replace(goal, target=step.target)
             if not isinstance(goal.target, TaughtTarget):
                 return goal
             resolved = self._teaching.resolve(goal.target)
@@ -219,7 +227,7 @@ class Intake:
                 while len(self._goals) > KNOWN_GOALS:
                     self._goals.popitem(last=False)
                 if reply.accepted:
-                    self._running[goal.id] = RunningGoal(goal, pending.operator, event.plan)
+                    self._running[goal.id] = RunningGoal(_listed(goal, event.plan), pending.operator, event.plan)
                     while len(self._running) > KNOWN_GOALS:
                         self._running.popitem(last=False)
                     self._log.add_core(event, "goal_accepted", pending.operator)
@@ -277,6 +285,17 @@ class Intake:
                 reasons=reply.reasons,
                 origin="gateway",
             )
+
+
+def _listed(goal: Goal, plan: PlanReport | None) -> Goal:
+    """``goal`` as it is listed while it runs: a step as the set-points at the end of its plan, by which pages draw it
+    and which clients of former versions can read.
+    """
+    if not isinstance(goal.target, DisplacementTarget) or goal.target.frame is None:
+        return goal
+    pixels = {} if plan is None else plan.pixels
+    ends = {camera: {marker: path[-1] for marker, path in seen.items() if path} for camera, seen in pixels.items()}
+    return msgspec.structs.replace(goal, target=FeatureTarget(ends, goal.target.model_epoch))
 
 
 def payload_of(message: Any) -> bytes:

@@ -144,13 +144,14 @@ class Gateway:
         self._notes = OperatorNotes(self.log, plan.joints.notes)
         self._servo = ServoConnection(directories)
         self._replies = ReplyThread()
+        known_length = "" if plan.cell.calibration is None else plan.cell.calibration.known_length
         self._calibration = CalibrationJobs(
             self.settings,
             self._models,
             self._servo,
             self.log,
             directories.checks,
-            "" if plan.cell.calibration is None else plan.cell.calibration.known_length,
+            known_length,
             directories.runtime,
         )
         self._relocalization = RelocalizationJobs(
@@ -158,7 +159,9 @@ class Gateway:
         )
         self._marker_cache = ObservationCache({camera.name: camera.systematic_px for camera in self.settings.cameras})
         taught = TaughtStore(directories.taught, self._models.of_epoch, self._notes.set_note)
-        self._teaching = TaughtGoalRegistry(taught, self._marker_cache, lambda: self._calibration.model, self.log)
+        self._teaching = TaughtGoalRegistry(
+            taught, self._marker_cache, lambda: self._calibration.model, self.log, known_length
+        )
         self._intake = Intake(self.keys, self._servo, self._replies, self.log, self._context, self._teaching, self.boot)
         self._refinement = RefinementJobs(
             self.settings, plan.cell.calibration is not None and plan.cell.calibration.refine, self._models,

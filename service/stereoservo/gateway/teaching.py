@@ -14,7 +14,7 @@ import numpy as np
 
 from stereoservo.core.cycle import Event
 from stereoservo.daemon.taught_goals import TaughtGoal, taught_goal, taught_model
-from stereoservo.gateway.goal_transfer import TransferredGoal, resolve
+from stereoservo.gateway.goal_transfer import TransferredGoal, resolve, resolve_step
 from stereoservo.gateway.marker_views import model_frame, observed_views
 from stereoservo.gateway.observation_cache import MarkerObservations, ObservationCache
 from stereoservo.gateway.persistence import TaughtStore
@@ -34,7 +34,16 @@ from stereoservo.geometry.alignment import DRAWING, drawn_points, family_between
 from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import carried_point_covariance
 from stereoservo.kinematics.model import CellModel
-from stereoservo.messages.goals import Feature, FeatureTarget, IncidenceTarget, MarkerId, Pixel, TaughtTarget
+from stereoservo.messages.goals import (
+    Centre,
+    Feature,
+    FeatureTarget,
+    IncidenceTarget,
+    MarkerId,
+    Pixel,
+    StepTarget,
+    TaughtTarget,
+)
 from stereoservo.messages.wire import Synthesise
 
 KNOWN_TOOLS = 100
@@ -49,7 +58,9 @@ class TaughtGoalRegistry:
         observations: ObservationCache,
         model: Callable[[], CellModel | None],
         log: EventLog,
+        known_length: str = "",
     ) -> None:
+        self._known_length = known_length
         self._store = store
         self._marker_cache = observations
         self._model = model
@@ -97,6 +108,10 @@ class TaughtGoalRegistry:
     def resolve(self, target: TaughtTarget) -> TransferredGoal:
         """Set-points of a taught goal. Raises KeyError, TransferError."""
         return resolve(target, self._store.goals[target.name], self._model(), self._seen())
+
+    def resolve_step(self, step: StepTarget, centre: Centre | None) -> TransferredGoal:
+        """A step in a person's frame as a displacement. Raises TransferError."""
+        return resolve_step(step, centre, self._model(), self._seen(), self._known_length)
 
     def seen_when_taught(self, target: TaughtTarget, markers: tuple[MarkerId, ...]) -> dict[str, dict[int, Pixel]]:
         """Raw pixels, by camera, of the ``markers`` that are not on the body, as stored when the goal was taught.

@@ -6,6 +6,8 @@ Each problem names the field, its value and the valid values; all of them are re
 
 from __future__ import annotations
 
+import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -27,11 +29,13 @@ from stereoservo.messages.goals import (
     JointTarget,
     OrderAuxiliary,
     PointTarget,
+    StepTarget,
     Target,
     TaughtTarget,
     Teach,
     UpdateGoal,
 )
+from stereoservo.messages.known_length import known_length_of
 
 LAW_FIELDS = (
     "law", "points", "jacobian", "centre", "cameras", "profile", "gain", "damping", "tolerance_px", "blend_px",
@@ -51,6 +55,8 @@ def _check_target(target: Target, context: GoalContext) -> list[str]:
         return check_points(target, context)
     if isinstance(target, DisplacementTarget):
         return check_displacement(target, context)
+    if isinstance(target, StepTarget):
+        return check_step(target, context)
     if isinstance(target, TaughtTarget):
         return check_taught(target, context)
     if isinstance(target, JointTarget):
@@ -266,6 +272,10 @@ __all__ = ["GoalContext", "check_command", "check_goal"]
 POINTS_OF = {"point": 1, "line": 2, "plane": 3}
 SINGULAR = 1e-12
 """Least singular value of a displacement relative to its largest."""
+ORTHONORMAL = 1e-6
+"""Largest deviation of a rigid matrix, as it is written down, from one."""
+MAX_STEP = 100.0
+"""Largest number of a step [m or rad]."""
 STRAIGHT = 1e-9
 """Largest third singular value of points on one line, as unit vectors."""
 
@@ -407,8 +417,11 @@ def check_displacement(target: DisplacementTarget, context: GoalContext) -> list
     if (target.model_epoch is None) == (target.basis is None):
         given = "neither" if target.basis is None else "both"
         problems.append(
-            f"target: {given} of model_epoch and basis given; exactly one says in which frame the matrix is"
+            f"target: {given} of model_epoch and basis given; exactly one says in which frame the matrix is (a rigid "
+            "matrix in metres is a target of kind 'step', with the name of its frame)"
         )
+    if target.frame is not None:
+        problems.append("target.frame: is set by the daemon; send a target of kind 'step' with the name of its frame")
     if target.basis is not None:
         problems += check_markers("target.basis", list(target.basis), context, body=True)
     matrix = np.array(target.matrix).reshape(4, 4)
@@ -423,6 +436,46 @@ def check_displacement(target: DisplacementTarget, context: GoalContext) -> list
         problems.append(
             "target.matrix: its determinant is negative, which makes a mirror image; a displacement's is positive"
         )
+    return problems
+
+
+def check_step(target: StepTarget, context: GoalContext) -> list[str]:
+    """Problems of a step: an unknown frame, no motion, a turn beyond 180°, or a matrix that is not rigid."""
+    cameras = [f"camera:{camera.name}" for camera in context.settings.cameras]
+    problems, ids = [], re.fullmatch(r"scene:(\d{1,9})-(\d{1,9})-(\d{1,9})", target.frame)
+    if target.frame not in ("tool", "base", *cameras) and ids is None:
+        problems.append(
+            f"target.frame: no frame {target.frame!r}; valid: tool, base, {listed(cameras)}, and scene:A-B-C by three "
+            "markers that do not move with the arm"
+        )
+    if ids is not None:
+        problems += check_markers("target.frame", [int(marker) for marker in ids.groups()], context, body=False)
+    if target.length:
+        try:
+            known_length_of(target.length)
+        except ValueError as error:
+            problems.append(f"target.length: {error}")
+    moves = any(target.move) or any(target.turn)
+    if moves == (target.matrix is not None):
+        problems.append("target: exactly one of matrix, and of move or turn that are not zero, is valid")
+    for key, values in {"move": target.move, "turn": target.turn, "matrix": target.matrix or ()}.items():
+        if max(map(abs, values), default=0.0) > MAX_STEP:
+            problems.append(
+                f"target.{key}: its largest number is {max(map(abs, values)):g}; up to {MAX_STEP:g} is valid"
+            )
+    angle = math.hypot(*target.turn)
+    if angle > math.pi * (1.0 + ORTHONORMAL):
+        problems.append(
+            f"target.turn: {math.degrees(angle):.6g}°; up to 180° is valid, make several steps of a larger one"
+        )
+    if target.matrix is not None:
+        H = np.array(target.matrix).reshape(4, 4)
+        off = max(float(np.abs(H[:3, :3].T @ H[:3, :3] - np.eye(3)).max()), float(np.abs(H[3] - (0, 0, 0, 1)).max()))
+        if not off <= ORTHONORMAL or np.linalg.det(H[:3, :3]) < 0.0:
+            problems.append(
+                f"target.matrix: is not rigid, by {off:.3g}; a rotation (3 x 3, determinant 1), a translation [m] and "
+                "the last row 0 0 0 1 are needed"
+            )
     return problems
 
 

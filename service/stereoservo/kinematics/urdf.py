@@ -9,15 +9,14 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from stereoservo.geometry.strata import decompose_camera
-from stereoservo.kinematics.axes import Axes, framed_model, unit
+from stereoservo.kinematics.axes import framed_model
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.denavit_hartenberg import axes_at_origin, base_origin, metres_per_length
+from stereoservo.kinematics.metric_frames import base_axes
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.known_length import KnownLength
 from stereoservo.numerics.arrays import FloatArray
 
-SQUARE = np.radians(2.0)
-"""Largest deviation from right angles [rad] of three prismatic joints that count as the axes of a base."""
 UNBOUNDED = 1e3
 """Limit of a prismatic joint without stated limits [m]."""
 FASTEST = 1.0
@@ -52,7 +51,7 @@ def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
     metres = metres_per_length(model, known)
     parts = framed_model(model)
     axes = axes_at_origin(parts)
-    origin, R = base_origin(axes), _root_axes(axes)
+    origin, R = base_origin(axes), base_axes(axes)
     to_root = np.eye(4)
     to_root[:3, :3], to_root[:3, 3] = metres * R.T, -metres * R.T @ origin
     at_zero = ProjectiveChain(parts.kinds, parts.generators, parts.zero).displacement(np.zeros(len(parts.kinds)))
@@ -79,20 +78,6 @@ def metric_arm(model: CellModel, known: KnownLength) -> MetricArm:
         cameras,
         "cameras" if carries_cameras else "markers",
     )
-
-
-def _root_axes(axes: Axes) -> FloatArray:
-    """Axes (3, 3) of the root frame, as columns, by the rules of `metric_arm`."""
-    D = axes.directions
-    if axes.kinds[:3] == ("prismatic",) * 3:
-        u, _, vt = np.linalg.svd(D[:3].T)
-        nearest: FloatArray = u @ vt
-        if np.linalg.det(nearest) > 0 and np.abs(D[:3].T - nearest).max() < SQUARE:
-            return nearest
-    z = D[0]
-    across = [w - z * (w @ z) for w in (*D[1:], *np.eye(3)) if np.linalg.norm(np.cross(w, z)) > np.sin(SQUARE)]
-    x = unit(across[0])
-    return np.column_stack([x, np.cross(z, x), z])
 
 
 def urdf_text(model: CellModel, arm: MetricArm, name: str, limits: Mapping[str, tuple[float, float, float]]) -> str:

@@ -187,7 +187,7 @@ class CalibrationSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     spread: SpreadSection | None = None
     known_length: str = ""
     """One length of arm, markers or cameras, as WHAT:OF=METRES (markers:10,11=0.05, baseline:left,right=0.2,
-    prismatic:j1=1, a:j2=0.4, d:j3=0.1): with it the report gives the arm's Denavit-Hartenberg parameters in metres.
+    prismatic:j1=1, a:j2=0.4, d:j3=0.1): it scales steps in metres, and the report's Denavit-Hartenberg parameters.
     """
     refine: bool = False
     """Refine the model on-line by the rest poses after goals; the calibrated one is kept."""

@@ -34,6 +34,8 @@ Epoch = Annotated[int, Meta(ge=0, le=2**63 - 1)]
 MarkerId = Annotated[int, Meta(ge=0, le=2**31 - 1)]
 Homogeneous = tuple[float, float, float, float]
 Pixel = tuple[float, float]
+Vector = tuple[float, float, float]
+Matrix = Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
 
 
 class FeatureTarget(msgspec.Struct, frozen=True, tag="features", tag_field="kind", forbid_unknown_fields=True):
@@ -55,17 +57,53 @@ class PointTarget(msgspec.Struct, frozen=True, tag="points", tag_field="kind", f
     model_epoch: Epoch
 
 
+class MetricFrame(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A Euclidean frame in the model's: ``pose``, 4x4, row-major, maps coordinates in it [m] to projective points, at
+    the model's zero if it moves ``with_body``, the marker body.
+
+    ``pivot`` [m]: coordinates, at the model's zero, of the point about which a displacement acts in place of the
+    frame's origin; it moves with the body if ``pivot_with_body``. ``scaled``: False if the unit of length is unknown.
+    """
+
+    name: str
+    pose: Matrix
+    with_body: bool
+    pivot: Vector
+    pivot_with_body: bool
+    scaled: bool = True
+
+
 class DisplacementTarget(msgspec.Struct, frozen=True, tag="displacement", tag_field="kind", forbid_unknown_fields=True):
     """A displacement of the marker body from its current pose: 4x4, row-major, projective, current -> goal.
 
     Either in the frame of the model of ``model_epoch``, or in the projective basis of five markers ``basis`` of the
     body, no four of them coplanar: in the coordinates in which their current positions are e1 … e4 and (1, 1, 1, 1), so
     that it does not depend on a calibration.
+    ``frame``, with ``model_epoch``: the matrix is rigid [m] in this frame, and displaces what the arm carries; this is
+    the form of a `StepTarget` inside the daemon.
     """
 
-    matrix: Annotated[tuple[float, ...], Meta(min_length=16, max_length=16)]
+    matrix: Matrix
     model_epoch: Epoch | None = None
     basis: tuple[MarkerId, MarkerId, MarkerId, MarkerId, MarkerId] | None = None
+    frame: MetricFrame | None = None
+
+
+class StepTarget(msgspec.Struct, frozen=True, tag="step", tag_field="kind", forbid_unknown_fields=True):
+    """A step of what the arm carries, from its current pose, along and about the axes of a ``frame``: ``tool``,
+    ``base``, ``camera:NAME``, or ``scene:A-B-C`` by three markers that do not move with the arm.
+
+    ``move`` [m], and ``turn`` [rad], a rotation vector of up to 180°, about the middle of the markers (cameras on the
+    arm: the centre of the first camera) or the goal's ``centre``. Or ``matrix``: 4x4, row-major, rigid [m], in the
+    frame's coordinates, about its origin.
+    ``length``: a known length, ``WHAT:OF=METRES``, for the scale; empty: the cell's, or the unit of a prismatic joint.
+    """
+
+    frame: Annotated[str, Meta(max_length=200)] = "tool"
+    move: Vector = (0.0, 0.0, 0.0)
+    turn: Vector = (0.0, 0.0, 0.0)
+    matrix: Matrix | None = None
+    length: Annotated[str, Meta(max_length=200)] = ""
 
 
 class TaughtTarget(msgspec.Struct, frozen=True, tag="taught", tag_field="kind", forbid_unknown_fields=True):
@@ -138,7 +176,7 @@ class IncidenceTarget(msgspec.Struct, frozen=True, tag="incidence", tag_field="k
     model_epoch: Epoch | None = None
 
 
-Target = FeatureTarget | PointTarget | DisplacementTarget | TaughtTarget | JointTarget | IncidenceTarget
+Target = FeatureTarget | PointTarget | DisplacementTarget | StepTarget | TaughtTarget | JointTarget | IncidenceTarget
 StreamedTarget = FeatureTarget | PointTarget
 
 

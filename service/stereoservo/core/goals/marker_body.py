@@ -34,14 +34,18 @@ from stereoservo.kinematics.kernels import (
     distort_pixel,
     exp_twist,
     image_jacobian,
+    invert4,
     multiply4_into,
     project_points,
     transform_points,
 )
+from stereoservo.messages.goals import DisplacementTarget, MetricFrame
 from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
 from stereoservo.numerics.compilation import kernel
 from stereoservo.numerics.linear import damped_least_squares
+from stereoservo.planning.motion_frame import rotation_between
 
+UNIT_VECTORS = np.vstack([np.eye(3), -np.eye(3)])
 RIGID_SHARE = 0.1
 """Largest deviation of goals in points or matrices from a rigid displacement, for their noise, as a fraction of the
 body's extent.
@@ -127,6 +131,62 @@ def _view(
             if -0.5 <= u <= sizes[c, 0] - 0.5 and -0.5 <= v <= sizes[c, 1] - 0.5:
                 shown[c, i] = 1.0
     return pixels, shown
+
+
+# -- steps in metres -------------------------------------------------------------------------------------------
+
+
+def displacement_in(frame: MetricFrame, rigid: FloatArray, arrays: ModelArrays, joints: FloatArray) -> FloatArray:
+    """Displacement (4, 4) of the marker body in the model's frame that moves what the arm carries by ``rigid`` (4, 4)
+    [m] in a ``frame`` about its pivot, with the arm at ``joints`` (n,).
+    """
+    A, pivot = _frame_at(frame, arrays, joints)
+    there, back = np.eye(4), np.eye(4)
+    there[:3, 3], back[:3, 3] = pivot[:3], -pivot[:3]
+    D = product4(product4(there, rigid), back)
+    return product4(product4(A, invert4(D) if arrays.tip_first else D), invert4(A))
+
+
+def step_made(target: DisplacementTarget, arrays: ModelArrays, start: FloatArray, now: FloatArray) -> str:
+    """The step that a ``target`` in a metric frame asked for, and the one made by the arm from its joints at the
+    ``start`` (n,) to those ``now`` (n,), corrected by the images: along and about the frame's axes, as text.
+    """
+    frame = target.frame
+    assert frame is not None
+    A, pivot = _frame_at(frame, arrays, start)
+    moved = product4(chain_at(arrays, now)[0], invert4(chain_at(arrays, start)[0]))
+    D = product4(product4(invert4(A), moved), A)
+    D = (invert4(D) if arrays.tip_first else D) / D[3, 3]
+    asked = np.array(target.matrix).reshape(4, 4)
+    texts = []
+    for H, move in (asked, asked[:3, 3]), (D, transform_points(D, pivot[None])[0, :3] - pivot[:3]):
+        x, y, z, angle = rotation_between(UNIT_VECTORS, np.vstack([H[:3, :3].T, -H[:3, :3].T]))
+        turn = np.degrees(angle) * np.array([x, y, z])
+        texts.append((f"{_three(1e3 * move)} mm, " if frame.scaled else "") + f"{_three(turn)}°")
+    return f"in {frame.name}: asked {texts[0]}; made {texts[1]}"
+
+
+def _three(values: FloatArray) -> str:
+    return f"({', '.join(f'{round(float(value), 2) + 0.0:.2f}' for value in values)})"
+
+
+def _frame_at(frame: MetricFrame, arrays: ModelArrays, joints: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Pose (4, 4) of a ``frame`` in the model's with the arm at ``joints`` (n,), and its pivot (4,) in it [m]."""
+    X = chain_at(arrays, joints)[0]
+    A = np.array(frame.pose).reshape(4, 4)
+    here = product4(X, A) if frame.with_body else A
+    pivot = np.array([*frame.pivot, 1.0])
+    if frame.pivot_with_body != frame.with_body:
+        back = product4(invert4(here), product4(X, A) if frame.pivot_with_body else A)
+        pivot = transform_points(back, pivot[None])[0]
+    return here, pivot / pivot[3]
+
+
+def product4(A: FloatArray, B: FloatArray) -> FloatArray:
+    """``A B`` of (4, 4), without BLAS."""
+    product = np.empty((4, 4))
+    multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
+    return product
 
 
 # -- its pose at the goal -------------------------------------------------------------------------------------

@@ -35,7 +35,7 @@ from stereoservo.core.sources.law import choose, goal_error, scene_and_task
 from stereoservo.core.state import IncidenceGoal, JointMove, PlanJob, Purpose, ServoGoal
 from stereoservo.kinematics.kernels import project_points
 from stereoservo.messages import goals
-from stereoservo.messages.goals import Goal, IncidenceTarget, JointTarget, PlanReport, TaughtTarget
+from stereoservo.messages.goals import Goal, IncidenceTarget, JointTarget, PlanReport, StepTarget, TaughtTarget
 from stereoservo.messages.reasons import Reason
 from stereoservo.messages.status import ModelReadiness
 from stereoservo.numerics.arrays import FloatArray
@@ -358,6 +358,8 @@ def prepare(
         return joint_goal(goal, target, context)
     if isinstance(target, TaughtTarget):
         raise RefusalError("TAUGHT_UNRESOLVED", f"taught goal {target.name!r} was not looked up", subject=target.name)
+    if isinstance(target, StepTarget):
+        raise RefusalError("STEP_UNRESOLVED", f"frame {target.frame!r} was not looked up", subject=target.frame)
     if context.state.reanchoring is not None:
         refuse_while_moved(context.state)
     epoch = trusted_model(context)
@@ -374,7 +376,9 @@ def prepare(
         joints=(context.q if joints is None else joints).copy(),
         points=body.points.copy(),
         goal=goal,
-        resolution=begin_resolution(body, context.q + context.state.block.correction, law.needs_goal_pose),
+        resolution=begin_resolution(
+            body, (context.q if joints is None else joints) + context.state.block.correction, law.needs_goal_pose
+        ),
     )
     if body.arrays.observation_count <= AT_ONCE:
         set_up(job, context)

@@ -23,12 +23,14 @@ from stereoservo.core.goals.marker_body import (
     determinant4,
     displacement_basis,
     displacement_by_law,
+    displacement_in,
     enough_in_view,
     enough_shown,
     in_front,
     keeps_its_shape,
     mirrored,
     one_body,
+    product4,
     reached_pose,
     refined_pose,
     turned_to,
@@ -40,7 +42,6 @@ from stereoservo.core.settings import FEWEST_MARKERS, MIN_MARKERS, CameraSetting
 from stereoservo.core.state import GoalResolution
 from stereoservo.kinematics.kernels import (
     invert4,
-    multiply4_into,
     transform_points,
     triangulate,
     undistort_pixel,
@@ -323,9 +324,11 @@ def _displacement(goal: GoalResolution, target: DisplacementTarget, place: BodyS
             "give basis",
         )
     H = _proper(matrix)
-    if target.basis is not None:
+    if target.frame is not None:
+        H = displacement_in(target.frame, matrix, arrays, goal.joints)
+    elif target.basis is not None:
         E = _basis(target.basis, place)
-        H = _product(_product(E, H), invert4(E))
+        H = product4(product4(E, H), invert4(E))
     moved = transform_points(np.ascontiguousarray(H), place.points)
     heights = (moved * arrays.plane_at_infinity).sum(axis=-1)
     lowest, highest = float(np.abs(heights).min()), float(np.abs(heights).max())
@@ -466,7 +469,7 @@ def _by_the_arm(goal: GoalResolution, place: BodyState) -> None:
     goal.known, goal.pose_known = np.ones(len(reached.points), dtype=bool), True
     in_front(place, goal.points, goal.known)
     at_goal, at_start = chain_at(arrays, reached.joints)[0], chain_at(arrays, start)[0]
-    goal.displacement = _product(at_goal, invert4(at_start))
+    goal.displacement = product4(at_goal, invert4(at_start))
     pixels, shown = view_of(place.settings, arrays, reached.points)
     goal.face = _face(pixels, shown, goal.known, arrays)
 
@@ -573,9 +576,3 @@ def _largest_triangle(candidates: IntArray, set_points: FloatArray, required: Fl
                     largest = area
                     best[0], best[1], best[2] = i, j, k
     return best, largest
-
-
-def _product(A: FloatArray, B: FloatArray) -> FloatArray:
-    product = np.empty((4, 4))
-    multiply4_into(np.ascontiguousarray(A), np.ascontiguousarray(B), product)
-    return product

@@ -19,7 +19,7 @@ from stereoservo.core.prediction import chain_at
 from stereoservo.core.state import GoalResolution, ServoGoal
 from stereoservo.core.target.follow import require_followable
 from stereoservo.kinematics.kernels import invert4, transform_points
-from stereoservo.messages.goals import AdaptiveGain, Centre, Goal, JacobianName, LawName, PlanReport
+from stereoservo.messages.goals import AdaptiveGain, Centre, DisplacementTarget, Goal, JacobianName, LawName, PlanReport
 from stereoservo.numerics.arrays import FloatArray
 
 JACOBIANS: dict[JacobianName, JacobianChoice] = {
@@ -51,6 +51,7 @@ def start_servoing(goal: Goal, resolved: GoalResolution, context: StepContext) -
     if goal.follow_markers:
         require_followable(goal, LAWS[name].follows_streams, name, resolved.pose_known, context)
     weights, body, centre_target = _centre(goal.centre, resolved, arrays, model.epoch)
+    is_step = isinstance(goal.target, DisplacementTarget) and goal.target.frame is not None and not goal.follow_markers
     return ServoGoal(
         **run_fields(goal, context, used_cameras(goal, resolved.wanted, context)),
         law=name,
@@ -66,6 +67,7 @@ def start_servoing(goal: Goal, resolved: GoalResolution, context: StepContext) -
         centre_target=centre_target,
         faces=resolved.faces,
         choice=NOT_CHOSEN._replace(triple=resolved.face),
+        step_from=resolved.joints if is_step else None,
     )
 
 

@@ -16,7 +16,7 @@ from stereoservo.control.laws.stereo import NO_COMPONENTS, NO_STATUS
 from stereoservo.control.mobility_kernel import self_motion_from_limits
 from stereoservo.control.pd import damped_velocity
 from stereoservo.core.context import SourceOutput, StepContext, Workspace
-from stereoservo.core.goals.marker_body import markers_needed
+from stereoservo.core.goals.marker_body import markers_needed, step_made
 from stereoservo.core.model_arrays import ModelArrays
 from stereoservo.core.prediction import (
     Centre,
@@ -46,6 +46,7 @@ from stereoservo.core.sources.streaming import feed_forward, follow
 from stereoservo.core.state import IncidenceGoal, LawRun, ServoGoal
 from stereoservo.core.target.follow import Follower, follow_target, is_static, start_following
 from stereoservo.kinematics.kernels import project_points, transform_points
+from stereoservo.messages.goals import DisplacementTarget
 from stereoservo.messages.reasons import Reason
 from stereoservo.numerics.arrays import FloatArray, IntArray, Record
 from stereoservo.numerics.compilation import kernel
@@ -416,7 +417,13 @@ def _ended(
             return SourceOutput(
                 np.zeros_like(context.q), needs_features=True, error_px=error_px, reasons=(source.apart,)
             )
-        context.emit("goal_reached", id=source.goal.id, message=f"error {error_px:.4f} px", error_px=error_px)
+        message = f"error {error_px:.4f} px"
+        if isinstance(source, ServoGoal) and source.step_from is not None:
+            assert context.arrays is not None
+            assert isinstance(source.goal.target, DisplacementTarget)
+            now = context.q + context.state.block.correction
+            message += "; " + step_made(source.goal.target, context.arrays, source.step_from, now)
+        context.emit("goal_reached", id=source.goal.id, message=message, error_px=error_px)
         return SourceOutput(np.zeros_like(context.q), finished=True, reached=True, error_px=error_px)
     return None
 

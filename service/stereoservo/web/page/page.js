@@ -275,10 +275,12 @@ function showHead() {
 function showInfo(info) {
   joints = info.joints.map((joint) => joint.name);
   for (const { name, width, height, rate_hz: rate } of info.cameras) Object.assign(view(name), { width, height, rate });
+  const frames = ["tool", "base", ...info.cameras.map((camera) => `camera:${camera.name}`)], chosen = $("step-frame").value;
+  $("step-frame").replaceChildren(...frames.map((name) => new Option(name, name, false, name === chosen)));
   $("taught").replaceChildren(...info.taught.map((goal) => {
     const button = document.createElement("button");
     button.textContent = `Check “${goal.name}”`;
-    button.onclick = () => check(goal.name);
+    button.onclick = () => check({ name: goal.name });
     return button;
   }));
   redraw();
@@ -375,9 +377,18 @@ function showPlan(plan, what) {
 
 // -- goals ---------------------------------------------------------------------------------------------------------
 
-async function check(name) {
-  const answer = await command(name ? { do: "check", name } : { do: "check" });
+async function check(what = {}, name = what.name) {
+  const answer = await command({ do: "check", ...what });
   if (answer.ok) showPlan(answer.plan, `checked, nothing moves yet${name ? ` (${name})` : ""}`);
+}
+
+function checkStep(event) {
+  event.preventDefault();
+  const [kind, axis] = $("step-axis").value.split(" "), by = Number($("step-by").value), frame = $("step-frame").value;
+  const vector = [0, 0, 0];
+  vector[axis] = kind === "move" ? by / 1000 : (by * Math.PI) / 180;
+  const id = Array.from(crypto.getRandomValues(new Uint8Array(16)), (byte) => byte.toString(16).padStart(2, "0")).join("");
+  check({ goal: { id, target: { kind: "step", frame, [kind]: vector } } }, `${kind} ${"xyz"[axis]} by ${by} ${$("step-unit").textContent} in ${frame}`);
 }
 
 function pixelOf(v, event) {
@@ -481,6 +492,8 @@ for (const button of document.querySelectorAll("[data-do]")) {
   button.onclick = () => command(verb === "check-model" ? { do: "calibrate", check: true } : { do: verb });
 }
 $("check").onclick = () => check();
+$("step").onsubmit = checkStep;
+$("step-axis").onchange = () => { $("step-unit").textContent = $("step-axis").value.startsWith("move") ? "mm" : "°"; };
 $("go").onclick = go;
 $("turn-left").onclick = () => changed({ turn: -Math.PI / 36 });
 $("turn-right").onclick = () => changed({ turn: Math.PI / 36 });
