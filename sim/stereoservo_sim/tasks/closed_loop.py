@@ -372,7 +372,7 @@ def _arrays(knowledge: Knowledge) -> ModelArrays:
         row_ids=np.arange(m),
         row_of=np.arange(m),
         groups=None,
-        sights=m * len(knowledge.matrices),
+        observation_count=m * len(knowledge.matrices),
         joint_accuracy=None,
         joint_variances=np.zeros(n),
     )
