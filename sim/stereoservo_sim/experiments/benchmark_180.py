@@ -139,15 +139,17 @@ def _line_compared(law: str, rows: list[Curve]) -> list[Comparison]:
     )
     if not slow or len(first) < len(GAINS):
         return []
-    told, left = (", ".join(f"{way:.2g}" for way in ways) + " mm at gains " + GAINS_TOLD for ways in (first, corrected))
+    before_text, after_text = (
+        ", ".join(f"{value:.2g}" for value in values) + " mm at gains " + GAINS_TEXT for values in (first, corrected)
+    )
     grows, least = first == sorted(first), slow[0] < first[0]
     without = all(after <= 0.1 * before for after, before in zip(corrected, first, strict=True))
     return [
         of_statement("fig. 8.18", f"{law}, centre beside its line", "less at smaller gains, least with limited joints",
-                     f"{told}; limited to {JOINT_SPEED_DEG_S:g}°/s {slow[0]:.2g} mm",
+                     f"{before_text}; limited to {JOINT_SPEED_DEG_S:g}°/s {slow[0]:.2g} mm",
                      "it grows from gain to gain; limited below all", grows and least),
         of_statement("fig. 8.18", f"{law}, cause of the deviation", "integration error of the joint velocities",
-                     f"{left} if the step is corrected for it", "a tenth of it or less is left at each gain", without),
+                     f"{after_text} with the corrected step", "a tenth or less is left at each gain", without),
     ]  # fmt: skip
 
 
@@ -391,7 +393,7 @@ def _nearest(found: FloatArray, q: FloatArray) -> FloatArray | None:
 
 GAINS = (0.5, 1.0, 2.0, 4.0)
 """Gains [1/s]."""
-GAINS_TOLD = ", ".join(f"{gain:g}" for gain in GAINS)
+GAINS_TEXT = ", ".join(f"{gain:g}" for gain in GAINS)
 GAIN = 0.5
 NOISE_PX = 0.1
 JOINT_SPEED_DEG_S = 5.0
