@@ -112,6 +112,8 @@ _REPAIRS = (
     _Repair(re.compile(r"\"([^\"']*\\[^\"']*)\""), r"'\1'", "a backslash: taken as it is"),
     _Repair(re.compile(r"^(\s*\[[^\[\]#]*[^\[\]#\s])\s*$"), r"\1]", "a header without ']': taken as one"),
 )
+_KEY = re.compile(r"""\s*(?:[\w."'-]{1,60}\s*=|\[[\w.\s\[\]-]{1,60})""")
+"""What of a line is no value."""
 _PLACE = re.compile(r" \(at (?:line ([0-9]+), column [0-9]+|end of document)\)")
 
 
@@ -134,7 +136,8 @@ def toml_of(raw: bytes) -> tuple[dict[str, Any], list[Remark]]:
         except RecursionError as error:
             raise ValueError("is nested too deeply") from error
         line = lines[at]
-        key = line.partition("=")[0].strip()[:60] if at not in repaired else repaired[at]
+        shown = _KEY.match(line)
+        key = repaired[at] if at in repaired else shown[0].strip(" \t=") if shown is not None else ""
         for repair in _REPAIRS if at not in repaired else ():
             lines[at], count = repair.pattern.subn(repair.by, lines[at])
             if count:
@@ -159,7 +162,7 @@ def _leave_out(lines: list[str], at: int) -> None:
 
 
 _JSON_TOKEN = re.compile(
-    r"""(?P<string>"(?:[^"\\\n]|\\.)*")|(?P<quoted>'(?:[^'"\\\n]|\\.)*')|(?P<remark>//[^\n]*|\#[^\n]*|/\*.*?\*/)"""
+    r"""(?P<string>"(?:[^"\\\n]|\\.)*")|(?P<unended>"(?:[^"\\\n]|\\.)*\Z)|(?P<quoted>'(?:[^'"\\\n]|\\.)*')|(?P<remark>//[^\n]*|\#[^\n]*|/\*.*?\*/)"""
     r"""|(?P<open>[\[{])|(?P<close>[\]}])|(?P<comma>,)|(?P<word>[-+]?[A-Za-z_]+\b)|(?P<space>\s+)|(?P<other>[^\s,\[\]{}"'/#]+|.)""",
     re.DOTALL,
 )
@@ -194,41 +197,44 @@ def _clean_json(text: str) -> tuple[str, list[Remark]]:
     """The text as strict readers take it, with its lines, and what was odd; cut behind the last complete value."""
     parts: list[str] = []
     remarks: list[Remark] = []
-    closers: list[str] = []
-    complete, line, comma = (0, ""), 1, -1
+    complete, line, comma, depth = 0, 1, -1, 0
     for token in _JSON_TOKEN.finditer(text):
         kind, value = token.lastgroup, token[0]
+        if kind == "unended":
+            break
         if kind == "remark":
             remarks.append(Remark(line, value[:60], "a remark: left out"))
-            parts.append("\n" * value.count("\n"))
+            value = "\n" * value.count("\n")
         elif kind == "quoted":
             remarks.append(Remark(line, "", "quoted by ': read as by \""))
-            parts.append(f'"{value[1:-1]}"')
+            value = f'"{value[1:-1]}"'
         elif kind == "word" and value in _WORDS:
             remarks.append(Remark(line, value, f"read as {_WORDS[value]}"))
-            parts.append(_WORDS[value])
-        else:
-            if kind == "close" and comma >= 0:
-                remarks.append(Remark(line, f",{value}", "a comma before a bracket: left out"))
-                parts[comma] = ""
-            if kind == "comma":
-                complete = len(parts), "".join(reversed(closers))
-            parts.append(value)
-            if kind == "open":
-                closers.append("]" if value == "[" else "}")
-            elif kind == "close" and closers:
-                closers.pop()
-            if kind in ("open", "close"):
-                complete = len(parts), "".join(reversed(closers))
+            value = _WORDS[value]
+        elif kind == "close" and comma >= 0:
+            remarks.append(Remark(line, f",{value}", "a comma before a bracket: left out"))
+            parts[comma] = ""
+        depth += (kind == "open") - (kind == "close")
+        if kind == "comma":
+            complete = len(parts)
+        parts.append(value)
+        if kind in ("open", "close"):
+            complete = len(parts)
         if kind not in ("space", "remark"):
             comma = len(parts) - 1 if kind == "comma" else -1
-        line += value.count("\n")
-    if closers:
-        count, end = complete
-        line = "".join(parts[:count]).count("\n") + 1
-        remarks.append(Remark(line, "", "the file ends inside of what begins here: left out", lost=True))
-        return "".join((*parts[:count], end)), remarks
-    return "".join(parts), remarks
+        line += token[0].count("\n")
+    if depth <= 0:
+        return "".join(parts), remarks
+    del parts[complete:]
+    ends: list[str] = []
+    for part in parts:
+        if part in ("[", "{"):
+            ends.append("]" if part == "[" else "}")
+        elif part in ("]", "}") and ends:
+            ends.pop()
+    line = "".join(parts).count("\n") + 1
+    remarks.append(Remark(line, "", "the file ends inside of what begins here: left out", lost=True))
+    return "".join((*parts, *reversed(ends))), remarks
 
 
 # -- tables ---------------------------------------------------------------------------------------------------
@@ -257,10 +263,15 @@ def table_of(raw: bytes) -> Table:
         remarks.append(Remark(*lines.pop(0), f"cells are separated by {stated[1]!r}"))
     if not lines:
         raise ValueError("holds no header and no row")
+    heads = next((k for k, (_, line) in enumerate(lines) if not line.startswith("#")), len(lines))
+    if heads and (heads == len(lines) or re.match("[-+.0-9]", lines[heads][1])):
+        heads -= 1  # the last remark is the header
+    remarks += [Remark(number, line[:60], "a remark: left out") for number, line in lines[:heads]]
+    lines[: heads + 1] = [(lines[heads][0], lines[heads][1].removeprefix("#").strip())]
     count = Counter(lines[0][1])
     separator = next((mark for mark in ";\t,|" if count[mark] and count[mark] >= count[","]), " ")
     (_, header), *cells = _cells(lines, separator)
-    columns = [name.strip().removeprefix("#").strip() for name in header]
+    columns = [name.strip() for name in header]
     width = len(columns) - (columns[-1] == "")
     rows = []
     commas: list[Remark] = []
