@@ -31,12 +31,12 @@ LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
 """Least deviations of pixels [px], and of poses [rad, m]: smaller ones have no effect on any result."""
 NOISE_ROUNDS, NOISE_SETTLED = 15, 0.03
 """Most rounds of estimating the deviations, and their relative change at which they have converged."""
+DEGREE = 4
+"""Degree over the board of errors that count as smooth."""
 FALSE_ALARM = 1e-3
 """Probability that a test names anything in data without a fault."""
 SIGNIFICANT = 3.3
 """Standard deviations beyond which a value differs from another: once in a thousand by chance."""
-FOLDS = 4
-"""Parts in which poses are left out."""
 BLUR_PRIOR = 8.0
 """Weight, in pixel coordinates, of all views' common deviation in that of one view."""
 LIMITS = Limits(60, 1e-7, 1e-3)
@@ -135,9 +135,9 @@ class HandEyeProblem:
         """Orthonormal quadratic functions (c, s, m, 6) over the markers that each view shows; zero if they are fewer."""
         flat = self.views.layout[:, :2] - self.views.layout[:, :2].mean(axis=0)
         x, y = (flat / np.abs(flat).max(axis=0)).T
-        functions = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        functions = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
         U, sizes, _ = np.linalg.svd(self.views.seen[..., None] * functions, full_matrices=False)
-        functions = np.zeros((*self.views.seen.shape, 6))
+        functions = np.zeros((*self.views.seen.shape, functions.shape[1]))
         functions[..., : U.shape[-1]] = U * (sizes > 1e-6 * np.maximum(sizes[..., :1], 1e-9))[..., None, :]
         return functions
 
@@ -209,9 +209,9 @@ class HandEyeProblem:
         errors = self.whitened(np.where(seen[..., None], predicted - self.views.pixels, 0.0)[..., None])
         return float((errors**2).sum() + (self.prior_residuals(state) ** 2).sum())
 
-    def columns(self, state: HandEye) -> tuple[FloatArray, FloatArray]:
+    def columns(self, state: HandEye, plain: bool = False) -> tuple[FloatArray, FloatArray]:
         """Derivatives (s, k, p) and (s, k, 6) of the residuals of each view by the shared parameters and by the errors
-        of its pose; shared are, by camera, free intrinsics and A, then C and the scale.
+        of its pose; shared are, by camera, free intrinsics and A, then C and the scale. ``plain``: of the pixels [px], not whitened.
         """
         x, moved, _, y = self._points(state)
         c, s, m, _ = y.shape
@@ -239,11 +239,9 @@ class HandEyeProblem:
                 shared[k, ..., -1] = (onto @ x[:, :, None])[..., 0]
             own[k] = at @ (R @ after[:, None, :3, :3]) @ _cross(moved)
         mask = self.views.seen[..., None, None]
-        by_view = [
-            np.moveaxis(self.whitened(np.where(mask, one, 0.0)), 0, 1).reshape(s, c * m * 2, -1)
-            for one in (shared, own)
-        ]
-        return by_view[0], by_view[1]
+        both = np.where(mask, np.concatenate([shared, own], axis=-1), 0.0)
+        rows = np.moveaxis(both if plain else self.whitened(both), 0, 1).reshape(s, c * m * 2, -1)
+        return rows[..., :-6], rows[..., -6:]
 
     def blocks(self, state: HandEye) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal equations: ``core`` (p + 1, p + 1), ``cross`` (s, 6, p + 1) and ``square`` (s, 6, 6)."""
@@ -434,20 +432,26 @@ def fit_board(views: BoardViews, mount: Mount, state: HandEye) -> HandEyeFit:
 
 
 def left_out_px(fit: HandEyeFit) -> float:
-    """Error [px rms] of the pixels of trusted views that are predicted by a fit of the other ones, in `FOLDS` parts."""
-    views, errors = fit.problem.views, []
-    fold = np.arange(len(views.names)) % FOLDS
-    for k in range(FOLDS):
-        rest, left = fold != k, (fold == k) & fit.problem.trusted
-        if not left.any():
-            continue
-        problem = replace(
-            fit.problem, views=views.select(rest), trusted=fit.problem.trusted[rest], blur=fit.problem.blur[rest]
-        )
-        again = solved(problem, replace(fit.state, errors=fit.state.errors[rest]))
-        error = predicted_errors(again, views.select(left))
-        errors.append(error[np.isfinite(error)] ** 2)
-    return float(np.sqrt(2.0 * np.concatenate(errors).mean()))
+    """Error [px rms] of the pixels of trusted views, each predicted at its reported pose by the other views' fit, which is
+    found to first order.
+    """
+    problem = fit.problem
+    still = replace(fit.state, errors=np.tile(np.eye(4), (len(problem.trusted), 1, 1)))
+    shared, own = problem.columns(fit.state)
+    rest = np.moveaxis(problem.residuals(fit.state), 0, 1).reshape(len(own), -1, 1)
+    rows = np.concatenate([shared, rest], axis=2)
+    cross = own.swapaxes(1, 2) @ rows
+    cross[:, :, -1] += problem.prior * problem.prior_residuals(fit.state)
+    inverse = np.linalg.inv(own.swapaxes(1, 2) @ own + problem.prior[:, :, None] ** 2 * np.eye(6))
+    reduced = rows.swapaxes(1, 2) @ rows - cross.swapaxes(1, 2) @ inverse @ cross
+    others = reduced.sum(axis=0) - reduced
+    sizes = np.sqrt(np.maximum(np.diagonal(others, axis1=1, axis2=2)[:, :-1], 1e-30))
+    unit = others[:, :-1, :-1] / (sizes[:, :, None] * sizes[:, None])
+    steps = -(np.linalg.pinv(unit, rcond=1e-10, hermitian=True) @ (others[:, :-1, -1:] / sizes[..., None])) / sizes[..., None]
+    errors = np.moveaxis(problem.projected(still)[0] - problem.views.pixels, 0, 1)
+    errors = errors + (problem.columns(still, plain=True)[0] @ steps).reshape(errors.shape)
+    errors = errors[problem.trusted]
+    return float(np.sqrt(2.0 * (errors[np.isfinite(errors)] ** 2).mean()))
 
 
 def predicted_errors(fit: HandEyeFit, views: BoardViews) -> FloatArray:
