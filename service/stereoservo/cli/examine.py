@@ -17,10 +17,12 @@ import numpy as np
 import typer
 from scipy.spatial.transform import Rotation
 
+from stereoservo.calibration.examination.board_examination import BoardReport, examine_board
 from stereoservo.calibration.examination.examination import RecordingReport, examine_views
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import TrialCamera
+from stereoservo.cli.board_folder import BOARD, board_text, board_views, read_board
 from stereoservo.cli.output import CommandError, JsonOption, emit, log
 from stereoservo.core.state_encoding import StateVersionError, decode_state
 from stereoservo.kinematics.model import CellModel
@@ -64,6 +66,10 @@ def examine(
         views = read_data_set(dataset, units, cameras, detector)
     elif any(one is not None for one in (units, cameras, detector)):
         raise CommandError("dataset", f"--units, --cameras and --detector are for LeRobot data sets; {dataset} is none")
+    elif (dataset / BOARD).is_file():
+        found = examine_board_folder(dataset)
+        emit(found, board_text(found), json)
+        return
     elif dataset.is_dir():
         views = read_folder(dataset)
     elif dataset.is_file():
@@ -72,6 +78,16 @@ def examine(
         raise CommandError("dataset", f"{dataset} is no flight recording (*.mcap), folder or LeRobot data set")
     report = examine_views(views)
     emit(report, _text(report), json)
+
+
+def examine_board_folder(folder: Path) -> BoardReport:
+    """The report on a folder of a board's pictures at poses. Raises CommandError, CalibrationError."""
+    board, path = read_board(folder), folder / POSES
+    rows = _table(path, (ORDER, *POSE_COLUMNS))
+    numbers = [_whole(path, k, row, ORDER) for k, row in enumerate(rows, 2)]
+    views, drawn = board_views(folder, board, numbers, _hand_poses(path, rows))
+    report = examine_board(views, board.mount, board.ordered)
+    return msgspec.structs.replace(report, findings=(*drawn, *report.findings))
 
 
 def _text(report: RecordingReport) -> str:
@@ -397,6 +413,13 @@ def _joints(
 def _poses(
     path: Path, rows: Rows, order: np.ndarray[Any, Any]
 ) -> tuple[tuple[str, ...], tuple[Kind, ...], FloatArray, FloatArray]:
+    positions, generators, _ = free_arm(_hand_poses(path, rows)[order])
+    # Unwrap turns beyond half a turn.
+    return NAMES, KINDS, np.hstack([positions[:, :3], np.unwrap(positions[:, 3:], axis=0)]), generators
+
+
+def _hand_poses(path: Path, rows: Rows) -> FloatArray:
+    """Poses (s, 4, 4) of the hand in a table's rows."""
     lacking = [name for name in POSE_COLUMNS if name not in rows[0]]
     if lacking:
         raise CommandError("dataset", f"{path} lacks columns {', '.join(lacking)}; {','.join(POSE_COLUMNS)} are needed")
@@ -409,9 +432,7 @@ def _poses(
     poses = np.tile(np.eye(4), (len(values), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
     poses[:, :3, 3] = values[:, :3]
-    positions, generators, _ = free_arm(poses[order])
-    # Unwrap turns beyond half a turn.
-    return NAMES, KINDS, np.hstack([positions[:, :3], np.unwrap(positions[:, 3:], axis=0)]), generators
+    return poses
 
 
 # -- pictures and pixels --------------------------------------------------------------------------------------

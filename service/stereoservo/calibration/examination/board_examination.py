@@ -146,7 +146,10 @@ def _start(best: Explained, matrix: FloatArray) -> HandEye:
 def _ordered_views(views: BoardViews, best: Explained) -> tuple[BoardViews, list[str]]:
     """The views of an explanation with its poses, corners in one order, and the names of those that were turned."""
     used = replace(
-        views, names=tuple(views.names[k] for k in best.rows), poses=best.poses, pixels=views.pixels[:, best.rows].copy()
+        views,
+        names=tuple(views.names[k] for k in best.rows),
+        poses=best.poses,
+        pixels=views.pixels[:, best.rows].copy(),
     )
     order = half_turn(views.layout)[1]
     turned = np.flatnonzero(best.choice >= 2)
@@ -178,7 +181,9 @@ def _of_reading(best: Explained, given: Explained, found: list[Explained]) -> Fi
         for one in found
         if one.reading not in (best.reading, given.reading) and log_odds(best, one) < LEAST_ODDS
     ]
-    either = f"either {best.reading.sentence}, or {' or '.join(dict.fromkeys(alike))}" if alike else best.reading.sentence
+    either = (
+        f"either {best.reading.sentence}, or {' or '.join(dict.fromkeys(alike))}" if alike else best.reading.sentence
+    )
     return Finding(
         best.reading.kind, "", f"{either}: so read, the rotations of hand and board agree to {rest[1]:.2g} deg (median), as given "
         f"to {rest[0]:.2g} deg", best.reading.remedy, float(rest[0]), None, float(rest[1]), "deg", "; ".join(dict.fromkeys(alike)),
@@ -209,13 +214,17 @@ def _of_mount(mount: Mount, stated: Mount | None, odds: float) -> list[Finding]:
 
 
 def _half_turns(flipped: list[str], ordered: bool) -> list[Finding]:
-    text = f"views {', '.join(flipped)}: the corners are counted from the other end of the board than in the other views"
+    text = (
+        f"views {', '.join(flipped)}: the corners are counted from the other end of the board than in the other views"
+    )
     if ordered:
         text += ", though its pattern tells the ends apart: the board was turned by half a turn, or the corners are mistaken"
     else:
         text += "; the board looks alike after half a turn, and the poses decide which it is"
-    remedy = "use a board with an odd and an even count of corners, or a ChArUco board" if not ordered else (
-        "leave these views out, or take them again"
+    remedy = (
+        "use a board with an odd and an even count of corners, or a ChArUco board"
+        if not ordered
+        else ("leave these views out, or take them again")
     )
     return [Finding("half_turn", ",".join(flipped), text, remedy, len(flipped))]
 
@@ -233,7 +242,19 @@ def _of_scale(fit: HandEyeFit) -> list[Finding]:
                 f"the arm's positions are {scale:.4g} ± {deviation:.2g} times the board's lengths: either the poses are in "
                 f"{arm}, or the board's size is in {board} and was read as the other unit"
             )
-            return [Finding("unit", "", text, "state poses and sizes in metres", float(scale), float(deviation), 1.0, "", "square")]
+            return [
+                Finding(
+                    "unit",
+                    "",
+                    text,
+                    "state poses and sizes in metres",
+                    float(scale),
+                    float(deviation),
+                    1.0,
+                    "",
+                    "square",
+                )
+            ]
     layout = fit.problem.views.layout
     side = 1e3 * float(np.linalg.norm(layout[1] - layout[0]))
     return [Finding(
@@ -290,7 +311,21 @@ def _report(
         notes.append(f"the mount is not certain: log-odds {odds:.1f}, {LEAST_ODDS:.1f} are needed")
     if fit is None:
         return BoardReport(
-            best.mount, odds, len(views.names), 0, None, None, {}, None, None, None, None, None, (), tuple(findings), tuple(notes)
+            best.mount,
+            odds,
+            len(views.names),
+            0,
+            None,
+            None,
+            {},
+            None,
+            None,
+            None,
+            None,
+            None,
+            (),
+            tuple(findings),
+            tuple(notes),
         )
     q, problem, state = len(fit.problem.free), fit.problem, fit.state
     deviations = fit.deviations

@@ -194,7 +194,9 @@ class HandEyeProblem:
     def residuals(self, state: HandEye) -> FloatArray:
         """Residuals (c, s, m, 2) [sigmas]; zero where a marker was not seen."""
         predicted, _ = self.projected(state)
-        return self.whitened(np.where(self.views.seen[..., None], predicted - self.views.pixels, 0.0)[..., None])[..., 0]
+        return self.whitened(np.where(self.views.seen[..., None], predicted - self.views.pixels, 0.0)[..., None])[
+            ..., 0
+        ]
 
     def prior_residuals(self, state: HandEye) -> FloatArray:
         """Errors (s, 6) of the poses [sigmas]."""
@@ -447,7 +449,10 @@ def left_out_px(fit: HandEyeFit) -> float:
     others = reduced.sum(axis=0) - reduced
     sizes = np.sqrt(np.maximum(np.diagonal(others, axis1=1, axis2=2)[:, :-1], 1e-30))
     unit = others[:, :-1, :-1] / (sizes[:, :, None] * sizes[:, None])
-    steps = -(np.linalg.pinv(unit, rcond=1e-10, hermitian=True) @ (others[:, :-1, -1:] / sizes[..., None])) / sizes[..., None]
+    steps = (
+        -(np.linalg.pinv(unit, rcond=1e-10, hermitian=True) @ (others[:, :-1, -1:] / sizes[..., None]))
+        / sizes[..., None]
+    )
     errors = np.moveaxis(problem.projected(still)[0] - problem.views.pixels, 0, 1)
     errors = errors + (problem.columns(still, plain=True)[0] @ steps).reshape(errors.shape)
     errors = errors[problem.trusted]
