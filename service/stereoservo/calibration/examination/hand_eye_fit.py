@@ -23,12 +23,18 @@ from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
 LENSES: tuple[tuple[int, ...], ...] = (
-    (0,), (0, 2, 3), (0, 2, 3, 4), (0, 2, 3, 4, 5), (0, 2, 3, 4, 5, 6, 7), (0, 1, 2, 3, 4, 5, 6, 7, 8),
-)  # fmt: skip
+    (0, 2, 3),
+    (0, 2, 3, 4),
+    (0, 2, 3, 4, 5),
+    (0, 2, 3, 4, 5, 6, 7),
+    (0, 1, 2, 3, 4, 5, 6, 7, 8),
+)
 """Free intrinsics of the nested lens models, out of `INTRINSICS`: one is preferred if left-out poses do not refute it."""
 INTRINSICS = ("focal length", "aspect", "cu", "cv", "k1", "k2", "p1", "p2", "k3")
 LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
 """Least deviations of pixels [px], and of poses [rad, m]: smaller ones have no effect on any result."""
+OFF_CENTRE = 0.02
+"""Prior deviation of the principal point from the middle of the picture [image widths], as cameras are built."""
 NOISE_ROUNDS, NOISE_SETTLED = 15, 0.03
 """Most rounds of estimating the deviations, and their relative change at which they have converged."""
 DEGREE = 4
@@ -209,7 +215,8 @@ class HandEyeProblem:
         if (y[..., 2][seen] <= 0.0).any() or not np.isfinite(predicted[seen]).all():
             return np.inf
         errors = self.whitened(np.where(seen[..., None], predicted - self.views.pixels, 0.0)[..., None])
-        return float((errors**2).sum() + (self.prior_residuals(state) ** 2).sum())
+        priors = float((self.prior_residuals(state) ** 2).sum() + self.centre_prior(state)[-1, -1])
+        return float((errors**2).sum()) + priors
 
     def columns(self, state: HandEye, plain: bool = False) -> tuple[FloatArray, FloatArray]:
         """Derivatives (s, k, p) and (s, k, 6) of the residuals of each view by the shared parameters and by the errors
@@ -245,6 +252,17 @@ class HandEyeProblem:
         rows = np.moveaxis(both if plain else self.whitened(both), 0, 1).reshape(s, c * m * 2, -1)
         return rows[..., :-6], rows[..., -6:]
 
+    def centre_prior(self, state: HandEye) -> FloatArray:
+        """Prior information (p + 1, p + 1) on the principal points, residuals last; p as in `columns`."""
+        q, c = len(self.free), len(state.A)
+        rows = np.zeros((2 * c, c * (q + 6) + 6 + self.scaled + 1))
+        for k in range(c):
+            inverse = 1.0 / (OFF_CENTRE * self.views.sizes[k, 0])
+            away = state.intrinsics[k, 2:4] - 0.5 * (self.views.sizes[k] - 1.0)
+            for axis in (0, 1):
+                rows[2 * k + axis, [k * (q + 6) + self.free.index(2 + axis), -1]] = inverse, inverse * away[axis]
+        return np.asarray(rows.T @ rows)
+
     def blocks(self, state: HandEye) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Normal equations: ``core`` (p + 1, p + 1), ``cross`` (s, 6, p + 1) and ``square`` (s, 6, 6)."""
         shared, own = self.columns(state)
@@ -256,7 +274,7 @@ class HandEyeProblem:
         cross[:, :, -1] += self.prior * priors
         square = own.swapaxes(1, 2) @ own + self.prior[:, :, None] ** 2 * np.eye(6)
         flat = rows.reshape(-1, rows.shape[2])
-        core = flat.T @ flat
+        core = flat.T @ flat + self.centre_prior(state)
         core[-1, -1] += float((priors**2).sum())
         return core, cross, square
 
@@ -421,21 +439,33 @@ def fit_board(views: BoardViews, mount: Mount, state: HandEye) -> HandEyeFit:
     fit = without_misfits(with_estimated_noise(solved(problem, state)))
     if abs(fit.state.scale) < SIGNIFICANT * fit.deviations[-1]:
         fit = solved(replace(fit.problem, scaled=False), replace(fit.state, scale=0.0))
-    best, least = fit, np.inf
+    fits = []
     for free in LENSES:
-        fit = solved(replace(fit.problem, free=free), fit.state)
-        error = left_out_px(fit)
-        if fit.converged and error < least:
-            best, least = fit, error
-    best = without_misfits(with_estimated_noise(best))
+        fit = with_estimated_noise(solved(replace(fit.problem, free=free), fit.state))
+        fits.append(fit)
+    best = without_misfits(_preferred(fits))
     noise = np.append(best.problem.noise[:2], START_NOISE[2:])
     noisy = with_estimated_noise(solved(replace(best.problem, noise=noise), best.state))
-    return without_misfits(noisy) if left_out_px(noisy) < left_out_px(best) else best
+    noisier = [with_estimated_noise(solved(replace(noisy.problem, free=free), noisy.state)) for free in LENSES]
+    return without_misfits(_preferred([best, *noisier]))
 
 
-def left_out_px(fit: HandEyeFit) -> float:
-    """Error [px rms] of the pixels of trusted views, each predicted at its reported pose by the other views' fit, which is
-    found to first order.
+def _preferred(fits: list[HandEyeFit]) -> HandEyeFit:
+    """The likeliest of the fits, by the Bayesian information criterion, among those that predict left-out views as well
+    as the best one, within the standard error of the difference.
+    """
+    fits = [fit for fit in fits if fit.converged] or fits
+    squares = np.array([left_out_squares(fit) for fit in fits])
+    worse = squares - squares[squares.mean(axis=1).argmin()]
+    alike = worse.mean(axis=1) <= worse.std(axis=1) / np.sqrt(worse.shape[1])
+    rows = 2.0 * fits[0].problem.views.seen.sum()
+    scores = [fit.log_likelihood - 0.5 * len(fit.covariance) * np.log(rows) for fit in fits]
+    return fits[int(np.where(alike, scores, -np.inf).argmax())]
+
+
+def left_out_squares(fit: HandEyeFit) -> FloatArray:
+    """Mean squared error (k,) [px²] of the pixels of each trusted view, predicted at its reported pose by the other views'
+    fit, which is found to first order.
     """
     problem = fit.problem
     still = replace(fit.state, errors=np.tile(np.eye(4), (len(problem.trusted), 1, 1)))
@@ -446,7 +476,7 @@ def left_out_px(fit: HandEyeFit) -> float:
     cross[:, :, -1] += problem.prior * problem.prior_residuals(fit.state)
     inverse = np.linalg.inv(own.swapaxes(1, 2) @ own + problem.prior[:, :, None] ** 2 * np.eye(6))
     reduced = rows.swapaxes(1, 2) @ rows - cross.swapaxes(1, 2) @ inverse @ cross
-    others = reduced.sum(axis=0) - reduced
+    others = reduced.sum(axis=0) + problem.centre_prior(fit.state) - reduced
     sizes = np.sqrt(np.maximum(np.diagonal(others, axis1=1, axis2=2)[:, :-1], 1e-30))
     unit = others[:, :-1, :-1] / (sizes[:, :, None] * sizes[:, None])
     steps = (
@@ -455,8 +485,8 @@ def left_out_px(fit: HandEyeFit) -> float:
     )
     errors = np.moveaxis(problem.projected(still)[0] - problem.views.pixels, 0, 1)
     errors = errors + (problem.columns(still, plain=True)[0] @ steps).reshape(errors.shape)
-    errors = errors[problem.trusted]
-    return float(np.sqrt(2.0 * (errors[np.isfinite(errors)] ** 2).mean()))
+    squares = 2.0 * np.nanmean(errors**2, axis=(1, 2, 3))
+    return np.asarray(squares[problem.trusted])
 
 
 def predicted_errors(fit: HandEyeFit, views: BoardViews) -> FloatArray:
