@@ -35,6 +35,8 @@ LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
 """Least deviations of pixels [px], and of poses [rad, m]: smaller ones have no effect on any result."""
 OFF_CENTRE = 0.02
 """Prior deviation of the principal point from the middle of the picture [image widths], as cameras are built."""
+LEAST_TRUSTED = 6
+"""Number of views from which one may be left out."""
 NOISE_ROUNDS, NOISE_SETTLED = 15, 0.03
 """Most rounds of estimating the deviations, and their relative change at which they have converged."""
 DEGREE = 4
@@ -329,10 +331,16 @@ class HandEyeFit:
         own = problem.noise[0] * problem.blur
         return float(-0.5 * self.cost - free - plain @ np.log(own) - smooth @ np.log(np.hypot(own, problem.noise[1])))
 
-    @property
+    @cached_property
     def deviations(self) -> FloatArray:
-        """Standard deviations (p,) of the shared parameters."""
-        return np.sqrt(np.diag(self.covariance))
+        """Standard deviations (p,) of the shared parameters; if poses count as exact, at least those by leaving out each
+        view (jackknife), since the errors of real ones are no noise of the pixels.
+        """
+        variances = np.diag(self.covariance)
+        if self.problem.exact:
+            steps = deletion_steps(self)[self.problem.trusted, :, 0]
+            variances = np.maximum(variances, (steps**2).sum(axis=0) * (1.0 - 1.0 / len(steps)))
+        return np.sqrt(variances)
 
     def misfits(self) -> FloatArray:
         """Decrease (s,) of the cost if a view's pose were free [sigmas²], all else fitted again; zero if not trusted."""
@@ -410,19 +418,33 @@ def _pixel_noise(fit: HandEyeFit, effective: float) -> tuple[FloatArray, FloatAr
 
 def without_misfits(fit: HandEyeFit) -> HandEyeFit:
     """The fit with those views' poses not trusted that do not fit the others: one after the other, by the F test of a
-    free pose against the errors of the others, of false-alarm probability `FALSE_ALARM` over all views.
+    free pose against the errors of the others, of false-alarm probability `FALSE_ALARM` over all views. Views that were
+    not trusted before are tested again.
     """
-    while True:
-        gains = fit.misfits()
-        worst = int(gains.argmax())
-        trusted = fit.problem.trusted
-        count = int(trusted.sum())
-        rest = max(float(gains.sum() - gains[worst]), 1e-9) / (6.0 * (count - 1))
-        if count <= 6 or f_distribution.sf(gains[worst] / 6.0 / rest, 6, 6 * (count - 1)) * count > FALSE_ALARM:
-            return fit
-        fewer = trusted.copy()
-        fewer[worst] = False
-        fit = with_estimated_noise(solved(replace(fit.problem, trusted=fewer), fit.state))
+    for k in np.flatnonzero(~fit.problem.trusted):
+        again = solved(_trusting(fit.problem, int(k), True), fit.state)
+        if _misfit_probability(again, int(k)) > FALSE_ALARM:
+            fit = with_estimated_noise(again)
+    while fit.problem.trusted.sum() > LEAST_TRUSTED:
+        worst = int(fit.misfits().argmax())
+        if _misfit_probability(fit, worst) > FALSE_ALARM:
+            break
+        fit = with_estimated_noise(solved(_trusting(fit.problem, worst, False), fit.state))
+    return fit
+
+
+def _trusting(problem: HandEyeProblem, view: int, trust: bool) -> HandEyeProblem:
+    trusted = problem.trusted.copy()
+    trusted[view] = trust
+    return replace(problem, trusted=trusted)
+
+
+def _misfit_probability(fit: HandEyeFit, view: int) -> float:
+    """Probability that any view of a set without a fault misfits as much as one does."""
+    gains = fit.misfits()
+    count = int(fit.problem.trusted.sum())
+    rest = max(float(gains.sum() - gains[view]), 1e-9) / (6.0 * (count - 1))
+    return float(f_distribution.sf(gains[view] / 6.0 / rest, 6, 6 * (count - 1)) * count)
 
 
 START_NOISE = np.array([0.5, 3.0, 2e-3, 2e-3])
@@ -436,9 +458,7 @@ def fit_board(views: BoardViews, mount: Mount, state: HandEye) -> HandEyeFit:
     s = len(views.names)
     noise = np.append(START_NOISE[:2], LEAST_NOISE[2:])
     problem = HandEyeProblem(views, mount, noise, LENSES[0], True, np.ones(s, dtype=np.bool_), np.ones(s))
-    fit = without_misfits(with_estimated_noise(solved(problem, state)))
-    if abs(fit.state.scale) < SIGNIFICANT * fit.deviations[-1]:
-        fit = solved(replace(fit.problem, scaled=False), replace(fit.state, scale=0.0))
+    fit = _of_known_size(without_misfits(with_estimated_noise(solved(problem, state))))
     fits = []
     for free in LENSES:
         fit = with_estimated_noise(solved(replace(fit.problem, free=free), fit.state))
@@ -447,7 +467,14 @@ def fit_board(views: BoardViews, mount: Mount, state: HandEye) -> HandEyeFit:
     noise = np.append(best.problem.noise[:2], START_NOISE[2:])
     noisy = with_estimated_noise(solved(replace(best.problem, noise=noise), best.state))
     noisier = [with_estimated_noise(solved(replace(noisy.problem, free=free), noisy.state)) for free in LENSES]
-    return without_misfits(_preferred([best, *noisier]))
+    return _of_known_size(without_misfits(_preferred([best, *noisier])))
+
+
+def _of_known_size(fit: HandEyeFit) -> HandEyeFit:
+    """The fit without a scale of the board that is not significant."""
+    if not fit.problem.scaled or abs(fit.state.scale) > SIGNIFICANT * fit.deviations[-1]:
+        return fit
+    return with_estimated_noise(solved(replace(fit.problem, scaled=False), replace(fit.state, scale=0.0)))
 
 
 def _preferred(fits: list[HandEyeFit]) -> HandEyeFit:
@@ -463,28 +490,28 @@ def _preferred(fits: list[HandEyeFit]) -> HandEyeFit:
     return fits[int(np.where(alike, scores, -np.inf).argmax())]
 
 
+def deletion_steps(fit: HandEyeFit) -> FloatArray:
+    """Changes (s, p, 1) of the shared parameters if a view is left out, to first order."""
+    problem = fit.problem
+    core, cross, square = problem.blocks(fit.state)
+    shared, own = problem.columns(fit.state)
+    rows = np.concatenate([shared, np.moveaxis(problem.residuals(fit.state), 0, 1).reshape(len(own), -1, 1)], axis=2)
+    eliminated = cross.swapaxes(1, 2) @ np.linalg.inv(square) @ cross
+    others = core - eliminated.sum(axis=0) - (rows.swapaxes(1, 2) @ rows - eliminated)
+    sizes = np.sqrt(np.maximum(np.diagonal(others, axis1=1, axis2=2)[:, :-1], 1e-30))
+    unit = others[:, :-1, :-1] / (sizes[:, :, None] * sizes[:, None])
+    unit = np.linalg.pinv(unit, rcond=1e-10, hermitian=True)
+    return np.asarray(-(unit @ (others[:, :-1, -1:] / sizes[..., None])) / sizes[..., None])
+
+
 def left_out_squares(fit: HandEyeFit) -> FloatArray:
     """Mean squared error (k,) [px²] of the pixels of each trusted view, predicted at its reported pose by the other views'
     fit, which is found to first order.
     """
     problem = fit.problem
     still = replace(fit.state, errors=np.tile(np.eye(4), (len(problem.trusted), 1, 1)))
-    shared, own = problem.columns(fit.state)
-    rest = np.moveaxis(problem.residuals(fit.state), 0, 1).reshape(len(own), -1, 1)
-    rows = np.concatenate([shared, rest], axis=2)
-    cross = own.swapaxes(1, 2) @ rows
-    cross[:, :, -1] += problem.prior * problem.prior_residuals(fit.state)
-    inverse = np.linalg.inv(own.swapaxes(1, 2) @ own + problem.prior[:, :, None] ** 2 * np.eye(6))
-    reduced = rows.swapaxes(1, 2) @ rows - cross.swapaxes(1, 2) @ inverse @ cross
-    others = reduced.sum(axis=0) + problem.centre_prior(fit.state) - reduced
-    sizes = np.sqrt(np.maximum(np.diagonal(others, axis1=1, axis2=2)[:, :-1], 1e-30))
-    unit = others[:, :-1, :-1] / (sizes[:, :, None] * sizes[:, None])
-    steps = (
-        -(np.linalg.pinv(unit, rcond=1e-10, hermitian=True) @ (others[:, :-1, -1:] / sizes[..., None]))
-        / sizes[..., None]
-    )
     errors = np.moveaxis(problem.projected(still)[0] - problem.views.pixels, 0, 1)
-    errors = errors + (problem.columns(still, plain=True)[0] @ steps).reshape(errors.shape)
+    errors = errors + (problem.columns(still, plain=True)[0] @ deletion_steps(fit)).reshape(errors.shape)
     squares = 2.0 * np.nanmean(errors**2, axis=(1, 2, 3))
     return np.asarray(squares[problem.trusted])
 
