@@ -1,5 +1,5 @@
-"""Examination of pictures of a known board at reported poses of an arm: what was fitted, with deviations, how well left-out
-poses are predicted, and the mistakes found in poses, pictures and board.
+"""Examination of pictures of a known board at reported poses of an arm: what was fitted, with deviations, how well
+left-out poses are predicted, and the mistakes found in poses, pictures and board.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ from itertools import combinations
 
 import msgspec
 import numpy as np
-from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from stereoservo.calibration.examination.hand_eye_fit import (
+    DEGREE,
     FALSE_ALARM,
     INTRINSICS,
     BoardViews,
@@ -38,6 +38,8 @@ from stereoservo.numerics.arrays import FloatArray
 
 SIZE_TOLERANCE = 0.02
 """Relative error of a printed and measured square up to which its size is not reported as wrong: a ruler's."""
+LEAST_BOARD_DEG = 5.0
+"""Rotation of the board in the pictures below which they do not distinguish readings of the poses' rotations."""
 SAME_POSE = 1e-5
 """Largest difference [rad, m] of reported poses that are the same: below the resolution of every arm."""
 PLACES = {"eye_in_hand": "in the hand", "eye_to_hand": "static"}
@@ -72,8 +74,8 @@ class BoardReport(msgspec.Struct, frozen=True):
     """Result of an examination. ``mount`` with ``mount_odds``, the logarithm of its odds against the other one.
 
     ``camera``: in the hand, or in the base if it is static; ``board``: in the base, or in the hand. ``intrinsics`` by
-    name with deviations. Deviations of single views: ``corner_px``, ``smooth_px`` (errors that are smooth over the board,
-    rms), ``pose_deg``, ``pose_mm``. ``held_out_px``: rms error of the predicted pixels of every second view by a fit of
+    name with deviations. Deviations of single views: ``corner_px``, ``smooth_px`` (errors that are smooth over the
+    board, rms), ``pose_deg``, ``pose_mm``. ``held_out_px``: rms error of the predicted pixels of every second view by a fit of
     the others, and the reverse, without the views that are left out by name.
     """
 
@@ -96,8 +98,8 @@ class BoardReport(msgspec.Struct, frozen=True):
 
 
 def examine_board(views: BoardViews, stated: Mount | None = None, ordered: bool = False) -> BoardReport:
-    """The report on views of a board; ``stated``: mount of the camera by its owner. ``ordered``: whether the identity of the
-    corners is certain, as with a tag or a board of odd and even counts. Raises CalibrationError (``too_few_views``).
+    """The report on views of a board; ``stated``: mount of the camera by its owner. ``ordered``: whether the identity of
+    the corners is certain, as with a tag or a board of odd and even counts. Raises CalibrationError (``too_few_views``).
     """
     board = board_poses(views, 0)
     seen = int(np.isfinite(board.poses[:, 0, 0, 0]).sum())
@@ -111,7 +113,8 @@ def examine_board(views: BoardViews, stated: Mount | None = None, ordered: bool 
     findings = _same_poses(views)
     found = explanations(board, views.poses, turns=True)
     given = next(one for one in found if one.reading.kind == "as_given")
-    best = found[0] if log_odds(found[0], given) > LEAST_ODDS else given
+    turning = rotations_of(board.poses[given.rows, given.choice]).extent_deg[0] > LEAST_BOARD_DEG
+    best = found[0] if turning and log_odds(found[0], given) > LEAST_ODDS else given
     if best is not given:
         findings.append(_of_reading(best, given, found))
     other = next(one for one in found if one.reading is best.reading and one.mount != best.mount)
@@ -175,7 +178,6 @@ def _same_poses(views: BoardViews) -> list[Finding]:
 
 
 def _of_reading(best: Explained, given: Explained, found: list[Explained]) -> Finding:
-    rest = np.degrees(np.median(given.form.turns)), np.degrees(np.median(best.form.turns))
     alike = [
         one.reading.sentence
         for one in found
@@ -184,10 +186,22 @@ def _of_reading(best: Explained, given: Explained, found: list[Explained]) -> Fi
     either = (
         f"either {best.reading.sentence}, or {' or '.join(dict.fromkeys(alike))}" if alike else best.reading.sentence
     )
+    odds = log_odds(best, given)
     return Finding(
-        best.reading.kind, "", f"{either}: so read, the rotations of hand and board agree to {rest[1]:.2g} deg (median), as given "
-        f"to {rest[0]:.2g} deg", best.reading.remedy, float(rest[0]), None, float(rest[1]), "deg", "; ".join(dict.fromkeys(alike)),
-    )  # fmt: skip
+        best.reading.kind,
+        "",
+        f"{either}: so read, the poses explain those of the board to {_rest(best)} (median), as given to {_rest(given)}",
+        best.reading.remedy,
+        odds,
+        None,
+        LEAST_ODDS,
+        "log-odds",
+        "; ".join(dict.fromkeys(alike)),
+    )
+
+
+def _rest(one: Explained) -> str:
+    return f"{np.degrees(np.median(one.form.turns)):.2g} deg and {1e3 * np.median(one.form.shifts):.2g} mm"
 
 
 def _little_rotation(extent: FloatArray, axis: str) -> Finding:
@@ -330,7 +344,8 @@ def _report(
     q, problem, state = len(fit.problem.free), fit.problem, fit.state
     deviations = fit.deviations
     scale = float(np.exp(state.scale))
-    own = np.sqrt(6.0 / max(len(views.layout), 6.0)) * problem.noise[1]
+    count = (DEGREE + 1) * (DEGREE + 2) // 2
+    own = np.sqrt(count / max(len(views.layout), count)) * problem.noise[1]
     return BoardReport(
         best.mount, odds, len(views.names), int(problem.trusted.sum()),
         _transform(np.linalg.inv(state.A[0]), deviations[q : q + 6]), _transform(state.C, deviations[q + 6 : q + 12]),
