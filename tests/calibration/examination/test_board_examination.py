@@ -1,10 +1,14 @@
-"""Pictures of a known board at poses of an arm, of random rigs with known truth: fit, deviations, and named mistakes."""
+"""Pictures of a known board at poses of an arm, of random rigs with known truth: fit, deviations, and named
+mistakes."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -23,8 +27,10 @@ from stereoservo.calibration.examination.hand_eye_fit import (
     solved,
     with_estimated_noise,
 )
+from stereoservo.cli.board_folder import read_board
+from stereoservo.cli.examine import examine_board_folder
 from stereoservo.messages.cell_file import Mount
-from stereoservo.numerics.arrays import FloatArray
+from stereoservo.ports.devices import Frame
 
 BOARD = np.array([[i % 7, i // 7, 0.0] for i in range(35)]) * 0.025
 SIZE = np.array([[640, 480]])
@@ -123,7 +129,7 @@ MISTAKES: dict[str, tuple[str, Callable[[BoardViews], BoardViews]]] = {
 def test_a_mistake_is_named_alone(mistake: str) -> None:
     kind, apply = MISTAKES[mistake]
     views, _ = rig(seed=2, mount="eye_in_hand", views=14)
-    assert kinds(examine_board(apply(views), ordered=True)) == [kind]
+    assert kinds(examine_board(apply(views), ordered=True, held_out=False)) == [kind]
 
 
 @pytest.mark.parametrize("mount", ["eye_in_hand", "eye_to_hand"])
@@ -143,7 +149,7 @@ def test_deviations_are_true_and_nothing_is_named(mount: Mount) -> None:
         freedom += len(error)
     print(f"seeds 100 to 103: {squares:.1f} of {freedom}")
     assert chi2.ppf(1e-4, freedom) < squares < 1.5 * chi2.isf(1e-4, freedom)
-    report = examine_board(views, ordered=True)
+    report = examine_board(views, ordered=True, held_out=False)
     assert report.mount == mount and report.findings == ()
 
 
@@ -151,10 +157,12 @@ def test_neither_origin_of_the_base_nor_order_matters() -> None:
     views, _ = rig(seed=5, mount="eye_to_hand", views=14)
     far = small_motion(np.array([0.4, -1.0, 2.0, 30.0, -8.0, 5.0]))
     order = np.random.default_rng(1).permutation(14)
-    first = examine_board(views)
-    moved_base = examine_board(replace(views, poses=far @ views.poses))
+    first = examine_board(views, held_out=False)
+    moved_base = examine_board(replace(views, poses=far @ views.poses), held_out=False)
     names = tuple(views.names[k] for k in order)
-    shuffled = examine_board(replace(views, names=names, poses=views.poses[order], pixels=views.pixels[:, order]))
+    shuffled = examine_board(
+        replace(views, names=names, poses=views.poses[order], pixels=views.pixels[:, order]), held_out=False
+    )
     for other in (moved_base, shuffled):
         assert other.mount == first.mount and other.findings == first.findings
         assert other.intrinsics.keys() == first.intrinsics.keys()
@@ -166,13 +174,40 @@ def test_neither_origin_of_the_base_nor_order_matters() -> None:
 
 @pytest.mark.parametrize(("axes", "kind"), [((0.0, 0.0, 1.0), "one_axis"), ((0.0, 0.0, 0.0), "translations_only")])
 def test_rotations_that_determine_nothing_are_named_with_their_remedy(axes: tuple[float, ...], kind: str) -> None:
-    views, _ = rig(seed=3, mount="eye_in_hand", views=14, axes=axes)
-    named = {one.kind: one for one in examine_board(views).findings}
+    views, _ = rig(seed=3, mount="eye_in_hand", views=10, axes=axes)
+    named = {one.kind: one for one in examine_board(views, held_out=False).findings}
     assert set(named) <= {kind, "undetermined", "not_fitted"}
     assert "about two axes" in named[kind].remedy and named[kind].limit == 20.0
 
 
 def test_a_mount_that_is_stated_wrongly_is_named_beside_inverted_poses() -> None:
     views, _ = rig(seed=4, mount="eye_in_hand", views=14)
-    [found] = examine_board(views, stated="eye_to_hand", ordered=True).findings
+    [found] = examine_board(views, stated="eye_to_hand", ordered=True, held_out=False).findings
     assert (found.kind, found.or_else) == ("mount", "inverted_poses")
+
+
+REAL = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shared" / "data")) / "hand_eye"
+
+
+@pytest.mark.skipif(not (REAL / "mycobot630_tag_a").is_dir(), reason="no hand_eye/mycobot630_tag_a in the data")
+def test_a_real_tag_before_a_static_camera_is_predicted_better_than_by_a_plain_bundle() -> None:
+    report = examine_board_folder(REAL / "mycobot630_tag_a")
+    assert (report.mount, report.used, report.findings) == ("eye_to_hand", 20, ())
+    assert max(report.held_out_px) < 2.4
+
+
+def test_a_charuco_board_is_found_in_both_patterns_and_in_part(tmp_path: Path) -> None:
+    for legacy in (False, True):
+        board = cv2.aruco.CharucoBoard((7, 5), 0.03, 0.022, cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50))
+        board.setLegacyPattern(legacy)
+        image = board.generateImage((700, 500), marginSize=30)
+        stated = '{"type": "charuco", "rows": 5, "cols": 7, "square_m": 0.03, "marker_m": 0.022}'
+        (tmp_path / "board.json").write_text(stated)
+        detector = read_board(tmp_path).detector()
+        whole = detector.detect(Frame("camera", 0, 0, 0, image), None)
+        part = detector.detect(Frame("camera", 0, 0, 0, np.ascontiguousarray(image[:, 150:])), None)
+        upside_down = detector.detect(Frame("camera", 0, 0, 0, np.ascontiguousarray(image[::-1, ::-1])), None)
+        assert whole.ids.tolist() == list(range(24))
+        assert 6 <= len(part.ids) < 24
+        assert np.abs(part.pixels + [150, 0] - whole.pixels[part.ids]).max() < 0.5
+        assert np.abs(np.array([699, 499]) - upside_down.pixels - whole.pixels).max() < 0.5

@@ -75,8 +75,8 @@ class BoardReport(msgspec.Struct, frozen=True):
 
     ``camera``: in the hand, or in the base if it is static; ``board``: in the base, or in the hand. ``intrinsics`` by
     name with deviations. Deviations of single views: ``corner_px``, ``smooth_px`` (errors that are smooth over the
-    board, rms), ``pose_deg``, ``pose_mm``. ``held_out_px``: rms error of the predicted pixels of every second view by a fit of
-    the others, and the reverse, without the views that are left out by name.
+    board, rms), ``pose_deg``, ``pose_mm``. ``held_out_px``: rms error of the predicted pixels of every second
+    view by a fit of the others, and the reverse, without the views that are left out by name.
     """
 
     mount: Mount | None
@@ -97,16 +97,20 @@ class BoardReport(msgspec.Struct, frozen=True):
     false_alarm: float = FALSE_ALARM
 
 
-def examine_board(views: BoardViews, stated: Mount | None = None, ordered: bool = False) -> BoardReport:
-    """The report on views of a board; ``stated``: mount of the camera by its owner. ``ordered``: whether the identity of
-    the corners is certain, as with a tag or a board of odd and even counts. Raises CalibrationError (``too_few_views``).
+def examine_board(
+    views: BoardViews, stated: Mount | None = None, ordered: bool = False, held_out: bool = True
+) -> BoardReport:
+    """The report on views of a board; ``stated``: mount of the camera by its owner. ``ordered``: whether the
+    identity of the corners is certain, as with a tag or a board of odd and even counts. ``held_out``: whether
+    halves of the views are learnt to predict the others. Raises CalibrationError (``too_few_views``).
     """
     board = board_poses(views, 0)
     seen = int(np.isfinite(board.poses[:, 0, 0, 0]).sum())
     if seen < LEAST_VIEWS:
         raise CalibrationError(
             "too_few_views",
-            f"the board is found in {seen} of {len(views.names)} pictures; {LEAST_VIEWS} are needed: check the counts of "
+            f"the board is found in {seen} of {len(views.names)} pictures; {LEAST_VIEWS} are needed: check the "
+            f"counts of "
             "its corners, its dictionary, and that all of it is in the picture",
             value=seen, limit=LEAST_VIEWS,
         )  # fmt: skip
@@ -130,14 +134,16 @@ def examine_board(views: BoardViews, stated: Mount | None = None, ordered: bool 
     fit = fit_board(used, best.mount, _start(best, board.matrix))
     if not fit.converged:
         findings.append(Finding(
-            "not_fitted", "", f"the fit did not converge; the poses explain the board to {1e3 * np.median(best.form.shifts):.3g}"
+            "not_fitted", "", f"the fit did not converge; the poses explain the board to "
+            f"{1e3 * np.median(best.form.shifts):.3g}"
             f" mm and {np.degrees(np.median(best.form.turns)):.3g} deg (median)",
             "see the other findings first; else take twenty views that turn the hand about two axes",
         ))  # fmt: skip
         return _report(views, best, odds, None, findings)
     findings += _of_scale(fit) + _of_views(fit)
     findings += _undetermined(fit, travel)
-    return _report(views, best, odds, fit, findings)
+    report = _report(views, best, odds, fit, findings)
+    return msgspec.structs.replace(report, held_out_px=held_out_px(fit)) if held_out else report
 
 
 def _start(best: Explained, matrix: FloatArray) -> HandEye:
@@ -172,7 +178,8 @@ def _same_poses(views: BoardViews) -> list[Finding]:
     text = ", ".join(f"{one} and {other}" for one, other in pairs[:5]) + (", …" if len(pairs) > 5 else "")
     return [Finding(
         "same_pose", pairs[0][1], f"the same pose stands at views {text}",
-        "if the arm had moved between the pictures, the pose was read before it arrived: read it at rest; if not, one of "
+        "if the arm had moved between the pictures, the pose was read before it arrived: read it at rest; if "
+        "not, one of "
         "the two views adds nothing", len(pairs),
     )]  # fmt: skip
 
@@ -190,7 +197,8 @@ def _of_reading(best: Explained, given: Explained, found: list[Explained]) -> Fi
     return Finding(
         best.reading.kind,
         "",
-        f"{either}: so read, the poses explain those of the board to {_rest(best)} (median), as given to {_rest(given)}",
+        f"{either}: so read, the poses explain those of the board to {_rest(best)} (median), as given to "
+        f"{_rest(given)}",
         best.reading.remedy,
         odds,
         None,
@@ -211,7 +219,8 @@ def _little_rotation(extent: FloatArray, axis: str) -> Finding:
     elif extent[1] < 2.0:
         kind, text = "one_axis", f"about one axis only ({axis}, {extent[0]:.0f} deg)"
     return Finding(
-        kind, "", f"the hand turns {text}; the translation of the hand-eye transform needs {LEAST_TURN_DEG:.0f} deg about two axes",
+        kind, "", f"the hand turns {text}; the translation of the hand-eye transform needs {LEAST_TURN_DEG:.0f} "
+        f"deg about two axes",
         f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two axes; further views like these do not help",
         float(extent[1]), None, LEAST_TURN_DEG, "deg",
     )  # fmt: skip
@@ -221,7 +230,8 @@ def _of_mount(mount: Mount, stated: Mount | None, odds: float) -> list[Finding]:
     if stated is None or stated == mount or odds < LEAST_ODDS:
         return []
     return [Finding(
-        "mount", "", f"the camera is stated as {PLACES[stated]}; the pictures fit only one that is {PLACES[mount]} (log-odds "
+        "mount", "", f"the camera is stated as {PLACES[stated]}; the pictures fit only one that is "
+        f"{PLACES[mount]} (log-odds "
         f"{odds:.0f}), or else the poses are inverted, of the base in the hand: the data do not distinguish the two",
         "correct the mount, or invert the poses", odds, None, LEAST_ODDS, "", "inverted_poses",
     )]  # fmt: skip
@@ -232,7 +242,8 @@ def _half_turns(flipped: list[str], ordered: bool) -> list[Finding]:
         f"views {', '.join(flipped)}: the corners are counted from the other end of the board than in the other views"
     )
     if ordered:
-        text += ", though its pattern tells the ends apart: the board was turned by half a turn, or the corners are mistaken"
+        text += ", though its pattern tells the ends apart: the board was turned by half a turn, or the corners "
+        "are mistaken"
     else:
         text += "; the board looks alike after half a turn, and the poses decide which it is"
     remedy = (
@@ -253,7 +264,8 @@ def _of_scale(fit: HandEyeFit) -> list[Finding]:
         if abs(np.log(scale / factor)) < np.log(2.0):
             arm, board = ("millimetres", "metres") if factor > 1.0 else ("metres", "millimetres")
             text = (
-                f"the arm's positions are {scale:.4g} ± {deviation:.2g} times the board's lengths: either the poses are in "
+                f"the arm's positions are {scale:.4g} ± {deviation:.2g} times the board's lengths: either the "
+                f"poses are in "
                 f"{arm}, or the board's size is in {board} and was read as the other unit"
             )
             return [
@@ -272,7 +284,8 @@ def _of_scale(fit: HandEyeFit) -> list[Finding]:
     layout = fit.problem.views.layout
     side = 1e3 * float(np.linalg.norm(layout[1] - layout[0]))
     return [Finding(
-        "square", "", f"the board's square (or tag) is {scale * side:.4g} ± {deviation * side:.2g} mm by the arm's metres, not "
+        "square", "", f"the board's square (or tag) is {scale * side:.4g} ± {deviation * side:.2g} mm by the "
+        f"arm's metres, not "
         f"{side:.4g} mm", f"measure it, over several squares, and state {scale * side:.4g} mm if that is so",
         float(scale * side), float(deviation * side), side, "mm",
     )]  # fmt: skip
@@ -285,7 +298,8 @@ def _of_views(fit: HandEyeFit) -> list[Finding]:
     usual = float(np.median(errors[problem.trusted]))
     for k in np.flatnonzero(~problem.trusted):
         found.append(Finding(
-            "view", problem.views.names[k], f"view {problem.views.names[k]} does not fit: {errors[k]:.3g} px, the others {usual:.3g} "
+            "view", problem.views.names[k], f"view {problem.views.names[k]} does not fit: {errors[k]:.3g} px, "
+            f"the others {usual:.3g} "
             "px (median); it is left out", "was the arm still moving, or the pose of another picture? Take it again",
             float(errors[k]), None, usual, "px",
         ))  # fmt: skip
@@ -295,7 +309,8 @@ def _of_views(fit: HandEyeFit) -> list[Finding]:
     for k in np.flatnonzero((logs - np.median(logs)) / spread > limit):
         found.append(Finding(
             "blurred", problem.views.names[k], f"view {problem.views.names[k]}: its corners are uncertain by "
-            f"{problem.noise[0] * problem.blur[k]:.2g} px, those of the others by {problem.noise[0]:.2g} px (blurred, overexposed, or "
+            f"{problem.noise[0] * problem.blur[k]:.2g} px, those of the others by {problem.noise[0]:.2g} px "
+            f"(blurred, overexposed, or "
             "drawn over); it counts less", "take it again, sharp and without drawings",
             float(problem.noise[0] * problem.blur[k]), None, float(problem.noise[0] * np.exp(limit * spread)), "px",
         ))  # fmt: skip
@@ -308,9 +323,11 @@ def _undetermined(fit: HandEyeFit, travel: float) -> list[Finding]:
     if deviation < travel:
         return []
     return [Finding(
-        "undetermined", "", f"the camera's place is not determined along one direction: {1e3 * deviation:.3g} mm, the hand moved by "
+        "undetermined", "", f"the camera's place is not determined along one direction: {1e3 * deviation:.3g} "
+        f"mm, the hand moved by "
         f"{1e3 * travel:.3g} mm in all; intrinsics, errors and predictions hold all the same",
-        f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two axes", 1e3 * float(deviation), None, 1e3 * travel, "mm",
+        f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two "
+        f"axes", 1e3 * float(deviation), None, 1e3 * travel, "mm",
     )]  # fmt: skip
 
 
@@ -352,8 +369,8 @@ def _report(
         {INTRINSICS[k]: (float(state.intrinsics[0, k]), float(deviations[i])) for i, k in enumerate(problem.free)},
         (scale, scale * float(deviations[-1]) if problem.scaled else 0.0),
         float(problem.noise[0]), float(own),
-        0.0 if problem.exact else float(np.degrees(problem.noise[2])), 0.0 if problem.exact else 1e3 * float(problem.noise[3]),
-        held_out_px(fit), tuple(findings), tuple(notes),
+        0.0 if problem.exact else float(np.degrees(problem.noise[2])), 0.0 if problem.exact else 1e3 *
+        float(problem.noise[3]), (), tuple(findings), tuple(notes),
     )  # fmt: skip
 
 

@@ -29,9 +29,9 @@ LENSES: tuple[tuple[int, ...], ...] = (
     (0, 2, 3, 4, 5, 6, 7),
     (0, 1, 2, 3, 4, 5, 6, 7, 8),
 )
-"""Free intrinsics of the nested lens models, out of `INTRINSICS`: one is preferred if left-out poses do not refute it."""
-INTRINSICS = ("focal length", "aspect", "cu", "cv", "k1", "k2", "p1", "p2", "k3")
-LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
+"""Free intrinsics of the nested lens models, out of `INTRINSICS`: one is preferred if left-out poses do not
+refute it.""" INTRINSICS = ("focal length", "aspect", "cu", "cv",
+"k1", "k2", "p1", "p2", "k3") LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
 """Least deviations of pixels [px], and of poses [rad, m]: smaller ones have no effect on any result."""
 OFF_CENTRE = 0.02
 """Prior deviation of the principal point from the middle of the picture [image widths], as cameras are built."""
@@ -123,8 +123,8 @@ def _cross(points: FloatArray) -> FloatArray:
 @dataclass(frozen=True)
 class HandEyeProblem:
     """The least-squares fit (:func:`stereoservo.calibration.least_squares.minimise`) of a `HandEye` to views with a
-    ``mount``; ``noise`` (4,): deviations of pixels [px], of their errors that are smooth over the board [px], such as those
-    of a lens and a bent board, and of rotation [rad] and translation [m] of the poses.
+    ``mount``; ``noise`` (4,): deviations of pixels [px], of their errors that are smooth over the board [px],
+    such as those of a lens and a bent board, and of rotation [rad] and translation [m] of the poses.
     ``free``: indices of the free intrinsics; ``scaled``: whether the board's scale is free. ``trusted`` (s,): views
     whose reported pose counts; of others only the picture does. ``blur`` (s,): deviation of each view's pixels
     relative to ``noise``.
@@ -140,13 +140,13 @@ class HandEyeProblem:
 
     @cached_property
     def smooth(self) -> FloatArray:
-        """Orthonormal quadratic functions (c, s, m, 6) over the markers that each view shows; zero if they are fewer."""
-        flat = self.views.layout[:, :2] - self.views.layout[:, :2].mean(axis=0)
-        x, y = (flat / np.abs(flat).max(axis=0)).T
-        functions = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
-        U, sizes, _ = np.linalg.svd(self.views.seen[..., None] * functions, full_matrices=False)
-        functions = np.zeros((*self.views.seen.shape, functions.shape[1]))
-        functions[..., : U.shape[-1]] = U * (sizes > 1e-6 * np.maximum(sizes[..., :1], 1e-9))[..., None, :]
+        """Orthonormal quadratic functions (c, s, m, 6) over the markers that each view shows; zero if they are
+        fewer.""" flat = self.views.layout[:,
+        :2] - self.views.layout[:, :2].mean(axis=0) x,
+        y = (flat / np.abs(flat).max(axis=0)).T functions = np.stack([x**i * y**j for i in range(DEGREE + 1)
+        for j in range(DEGREE + 1 - i)], axis=1) U, sizes, _ = np.linalg.svd(self.views.seen[..., None]
+        * functions, full_matrices=False) functions = np.zeros((*self.views.seen.shape,
+        functions.shape[1])) functions[..., : U.shape[-1]] = U * (sizes > 1e-6 * np.maximum(sizes[..., :1], 1e-9))[..., None, :]
         return functions
 
     def whitened(self, rows: FloatArray) -> FloatArray:
@@ -222,7 +222,8 @@ class HandEyeProblem:
 
     def columns(self, state: HandEye, plain: bool = False) -> tuple[FloatArray, FloatArray]:
         """Derivatives (s, k, p) and (s, k, 6) of the residuals of each view by the shared parameters and by the errors
-        of its pose; shared are, by camera, free intrinsics and A, then C and the scale. ``plain``: of the pixels [px], not whitened.
+        of its pose; shared are, by camera, free intrinsics and A, then C and the scale. ``plain``: of the
+        pixels [px], not whitened.
         """
         x, moved, _, y = self._points(state)
         c, s, m, _ = y.shape
@@ -287,8 +288,8 @@ class HandEyeProblem:
         inner = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
         outer = np.append(width, 1.0)
         return NormalEquations(
-            core / np.outer(outer, outer), cross / (inner[:, :, None] * outer), square / (inner[:, :, None] * inner[:, None]),
-            np.concatenate([width, inner.ravel()]), float(core[-1, -1]),
+            core / np.outer(outer, outer), cross / (inner[:, :, None] * outer), square / (inner[:, :, None] *
+            inner[:, None]), np.concatenate([width, inner.ravel()]), float(core[-1, -1]),
         )  # fmt: skip
 
     def retract(self, state: HandEye, x: FloatArray) -> HandEye:
@@ -333,8 +334,8 @@ class HandEyeFit:
 
     @cached_property
     def deviations(self) -> FloatArray:
-        """Standard deviations (p,) of the shared parameters; if poses count as exact, at least those by leaving out each
-        view (jackknife), since the errors of real ones are no noise of the pixels.
+        """Standard deviations (p,) of the shared parameters; if poses count as exact, at least those by
+        leaving out each view (jackknife), since the errors of real ones are no noise of the pixels.
         """
         variances = np.diag(self.covariance)
         if self.problem.exact:
@@ -343,12 +344,12 @@ class HandEyeFit:
         return np.sqrt(variances)
 
     def misfits(self) -> FloatArray:
-        """Decrease (s,) of the cost if a view's pose were free [sigmas²], all else fitted again; zero if not trusted."""
-        problem = self.problem
-        _, cross, square = problem.blocks(self.state)
-        prior = problem.prior**2
-        data = square - prior[:, :, None] * np.eye(6)
-        inverse = np.linalg.inv(square)
+        """Decrease (s,) of the cost if a view's pose were free [sigmas²], all else fitted again; zero if not
+        trusted.""" problem =
+        self.problem _, cross,
+        square = problem.blocks(self.state)
+        prior = problem.prior**2 data = square - prior[:, :,
+        None] * np.eye(6) inverse = np.linalg.inv(square)
         by_shared = cross[..., :-1] - data @ (inverse @ cross[..., :-1])
         known = by_shared @ self.covariance @ by_shared.swapaxes(1, 2) + data @ inverse @ data
         gradient = cross[:, :, -1] - prior * motion_vector(self.state.errors)
@@ -373,8 +374,8 @@ def solved(problem: HandEyeProblem, state: HandEye) -> HandEyeFit:
 
 
 def with_estimated_noise(fit: HandEyeFit) -> HandEyeFit:
-    """The fit with the deviations of pixels and poses estimated from the data (variance components); poses that count as
-    exact remain so.
+    """The fit with the deviations of pixels and poses estimated from the data (variance components); poses
+    that count as exact remain so.
     """
     for _ in range(NOISE_ROUNDS):
         problem = fit.problem
@@ -452,8 +453,9 @@ START_NOISE = np.array([0.5, 3.0, 2e-3, 2e-3])
 
 
 def fit_board(views: BoardViews, mount: Mount, state: HandEye) -> HandEyeFit:
-    """Fit of a board's views from a start. The board's scale is free if it differs significantly from 1. Lens terms, and
-    whether the poses count as exact, are those that predict left-out poses best; views that do not fit are not trusted.
+    """Fit of a board's views from a start. The board's scale is free if it differs significantly from 1. Lens
+    terms, and whether the poses count as exact, are those that predict left-out poses best; views that do not
+    fit are not trusted.
     """
     s = len(views.names)
     noise = np.append(START_NOISE[:2], LEAST_NOISE[2:])
@@ -505,8 +507,8 @@ def deletion_steps(fit: HandEyeFit) -> FloatArray:
 
 
 def left_out_squares(fit: HandEyeFit) -> FloatArray:
-    """Mean squared error (k,) [px²] of the pixels of each trusted view, predicted at its reported pose by the other views'
-    fit, which is found to first order.
+    """Mean squared error (k,) [px²] of the pixels of each trusted view, predicted at its reported pose by the
+    other views' fit, which is found to first order.
     """
     problem = fit.problem
     still = replace(fit.state, errors=np.tile(np.eye(4), (len(problem.trusted), 1, 1)))

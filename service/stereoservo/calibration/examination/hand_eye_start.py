@@ -1,5 +1,5 @@
-"""Start of a hand-eye fit: intrinsics and poses of a known board from its pictures, the order of its corners where it looks
-alike after half a turn, and both transforms in closed form from rotations, then translations.
+"""Start of a hand-eye fit: intrinsics and poses of a known board from its pictures, the order of its corners
+where it looks alike after half a turn, and both transforms in closed form from rotations, then translations.
 """
 
 from __future__ import annotations
@@ -139,8 +139,9 @@ class ClosedForm(NamedTuple):
 
 
 def closed_form(board: FloatArray, poses: FloatArray, mount: Mount) -> ClosedForm:
-    """Transforms from ``board`` (s, 4, 4) poses in the camera and ``poses`` (s, 4, 4) of the hand: rotations between views
-    about axes that ``A`` maps on each other, then translations and scale linearly; views far off count less.
+    """Transforms from ``board`` (s, 4, 4) poses in the camera and ``poses`` (s, 4, 4) of the hand: rotations
+    between views about axes that ``A`` maps on each other, then translations and scale linearly; views far off
+    count less.
     """
     G = motions(poses, mount)
     s = len(G)

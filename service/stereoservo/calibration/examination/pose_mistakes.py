@@ -79,7 +79,8 @@ READINGS: tuple[Reading, ...] = (
             "state that the rotation is a rotation vector (axis times angle)",
             _turned(lambda r: Rotation.from_rotvec(r.as_euler("xyz")))),
     Reading("rotation_vector", "the angles are Euler angles, and were read as a rotation vector",
-            "state the order and frame of the Euler angles", _turned(lambda r: Rotation.from_euler("xyz", r.as_rotvec()))),
+            "state the order and frame of the Euler "
+            "angles", _turned(lambda r: Rotation.from_euler("xyz", r.as_rotvec()))),
     Reading("degrees", "the angles are in radians, and were read as degrees",
             "state the unit of the angles", _turned(lambda r: Rotation.from_rotvec(np.degrees(r.as_rotvec())))),
     *(Reading("shifted", f"the pictures are shifted by {abs(by)} against the poses: picture k belongs to pose k{by:+d}",
