@@ -1,5 +1,4 @@
-"""Folders with a board (`board.json`), pictures and poses of the hand, for ``stereoservo examine``:
-docs/recordings.md."""
+"""Folders with a board (`board.json`), pictures and poses of the hand, for ``stereoservo examine``: docs/recordings.md."""
 
 from __future__ import annotations
 
@@ -31,8 +30,8 @@ COVERED = 0.05
 
 
 class Board(msgspec.Struct, frozen=True):
-    """``board.json``: ``rows`` and ``cols`` are inner corners of a chessboard, squares of a ChArUco board;
-    ``square_m`` is the side of a square, or of the tag [m]. ``mount``: of the camera, if it is known.
+    """``board.json``: ``rows`` and ``cols`` are inner corners of a chessboard, squares of a ChArUco board; ``square_m``
+    is the side of a square, or of the tag [m]. ``mount``: of the camera, if it is known.
     """
 
     type: Literal["chessboard", "charuco", "aruco"]
@@ -85,40 +84,20 @@ def read_board(folder: Path) -> Board:
     except (OSError, msgspec.DecodeError) as error:
         raise CommandError(
             "dataset",
-            f'{folder / BOARD}: {cause_of(error)};
-            valid is {{"type": "chessboard", "cols": 9, "rows": 6, "square_m": 0.025}}, ' "with type "
-            ""
-            ""
-            ""
-            ""
-            ""
-            ""
-            ""
-            ""
-            "chessboard, "
-            ""
-            ""
-            ""
-            "charuco "
-            ""
-            ""
-            ""
-            "(marker_m, dictionary) or aruco (tags, "
-            ""
-            ""
-            ""
-            "dictionary)",
+            f"{folder / BOARD}: {cause_of(error)}; valid is "
+            '{"type": "chessboard", "cols": 9, "rows": 6, "square_m": 0.025}, '
+            "with type chessboard, charuco (marker_m, dictionary) or aruco (tags, dictionary)",
         ) from error
 
 
-def board_views(folder: Path, board: Board, numbers: list[int],
-    poses: FloatArray) -> tuple[BoardViews, list[Finding]]: """The views of a folder at hand ``poses`` (s, 4, 4), of
-    the pictures with ``numbers`` (s,); views that were drawn over are named. Raises CommandError.
+def board_views(folder: Path, board: Board, numbers: list[int], poses: FloatArray) -> tuple[BoardViews, list[Finding]]:
+    """The views of a folder at hand ``poses`` (s, 4, 4), of the pictures with ``numbers`` (s,); views that were drawn
+    over are named. Raises CommandError.
     """
-    files = _pictures(folder,
-    numbers) detector, layout =
-    board.detector(), board.layout pixels = np.full((1, len(files), len(layout), 2),
-    np.nan) size, drawn = None, []
+    files = _pictures(folder, numbers)
+    detector, layout = board.detector(), board.layout
+    pixels = np.full((1, len(files), len(layout), 2), np.nan)
+    size, drawn = None, []
     for k, path in enumerate(files):
         image = None if path is None else cv2.imread(str(path), cv2.IMREAD_COLOR)
         if image is None:
@@ -134,10 +113,8 @@ def board_views(folder: Path, board: Board, numbers: list[int],
     found = int(np.isfinite(pixels[0, :, :, 0]).any(axis=1).sum())
     log(f"the board is found in {found} of {len(files)} pictures")
     findings = [] if not drawn else [Finding(
-        "drawings", ",".join(drawn), f"views {', '.join(drawn)}: coloured drawings cover the corners; they were "
-        f"painted over, and "
-        "the corners are less certain", "keep the pictures as the camera takes them, without detections drawn "
-        "in", len(drawn),
+        "drawings", ",".join(drawn), f"views {', '.join(drawn)}: coloured drawings cover the corners; they were painted over, and "
+        "the corners are less certain", "keep the pictures as the camera takes them, without detections drawn in", len(drawn),
     )]  # fmt: skip
     return BoardViews(tuple(map(str, numbers)), poses, layout, pixels, np.array([size])), findings
 
@@ -172,8 +149,7 @@ def _pictures(folder: Path, numbers: list[int]) -> list[Path | None]:
         raise CommandError(
             "dataset",
             f"{folder / PICTURES} has {len(files)} pictures, none with a number of poses.csv ({numbers[0]} to "
-            f"{numbers[-1]}) in its "
-            "name; 000.png, 001.png are valid",
+            f"{numbers[-1]}) in its name; 000.png, 001.png are valid",
         )
     return [found.get(number) for number in numbers]
 
@@ -187,15 +163,13 @@ def board_text(report: BoardReport) -> str:
         if one is not None:
             hand = (name == "camera") == (report.mount == "eye_in_hand")
             lines.append(
-                f"  {name} in the {'hand' if hand else 'base'}: "
-                f"" + _numbers(one.translation_mm, one.translation_deviation_mm, "mm")
+                f"  {name} in the {'hand' if hand else 'base'}: " + _numbers(one.translation_mm, one.translation_deviation_mm, "mm")
                 + ", rotation vector " + _numbers(one.rotation_deg, one.rotation_deviation_deg, "deg")
             )  # fmt: skip
     if report.intrinsics:
         lines.append("  " + ", ".join(f"{name} {v:.5g} ± {d:.2g}" for name, (v, d) in report.intrinsics.items()))
         lines.append(
-            f"  errors: corners {report.corner_px:.2g} px, lens and board {report.smooth_px:.2g} px, poses "
-            f"{report.pose_deg:.2g} deg "
+            f"  errors: corners {report.corner_px:.2g} px, lens and board {report.smooth_px:.2g} px, poses {report.pose_deg:.2g} deg "
             f"and {report.pose_mm:.2g} mm; {report.used} of {report.views} views"
         )
     if report.held_out_px:

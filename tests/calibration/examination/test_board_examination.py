@@ -150,7 +150,7 @@ def test_deviations_are_true_and_nothing_is_named(mount: Mount) -> None:
     print(f"seeds 100 to 103: {squares:.1f} of {freedom}")
     assert chi2.ppf(1e-4, freedom) < squares < 1.5 * chi2.isf(1e-4, freedom)
     report = examine_board(views, ordered=True, held_out=False)
-    assert report.mount == mount and report.findings == ()
+    assert (report.mount, report.findings) == (mount, ())
 
 
 def test_neither_origin_of_the_base_nor_order_matters() -> None:
@@ -164,11 +164,12 @@ def test_neither_origin_of_the_base_nor_order_matters() -> None:
         replace(views, names=names, poses=views.poses[order], pixels=views.pixels[:, order]), held_out=False
     )
     for other in (moved_base, shuffled):
-        assert other.mount == first.mount and other.findings == first.findings
+        assert (other.mount, other.findings) == (first.mount, first.findings)
         assert other.intrinsics.keys() == first.intrinsics.keys()
         for name, (value, deviation) in first.intrinsics.items():
             assert abs(other.intrinsics[name][0] - value) < 0.1 * deviation
-    assert first.board is not None and moved_base.board is not None
+    assert first.board is not None
+    assert moved_base.board is not None
     assert np.allclose(moved_base.board.translation_mm, first.board.translation_mm, atol=0.05)
 
 
@@ -177,7 +178,8 @@ def test_rotations_that_determine_nothing_are_named_with_their_remedy(axes: tupl
     views, _ = rig(seed=3, mount="eye_in_hand", views=10, axes=axes)
     named = {one.kind: one for one in examine_board(views, held_out=False).findings}
     assert set(named) <= {kind, "undetermined", "not_fitted"}
-    assert "about two axes" in named[kind].remedy and named[kind].limit == 20.0
+    assert "about two axes" in named[kind].remedy
+    assert named[kind].limit == 20.0
 
 
 def test_a_mount_that_is_stated_wrongly_is_named_beside_inverted_poses() -> None:
@@ -209,5 +211,5 @@ def test_a_charuco_board_is_found_in_both_patterns_and_in_part(tmp_path: Path) -
         upside_down = detector.detect(Frame("camera", 0, 0, 0, np.ascontiguousarray(image[::-1, ::-1])), None)
         assert whole.ids.tolist() == list(range(24))
         assert 6 <= len(part.ids) < 24
-        assert np.abs(part.pixels + [150, 0] - whole.pixels[part.ids]).max() < 0.5
+        assert np.abs(part.pixels + np.array([150, 0]) - whole.pixels[part.ids]).max() < 0.5
         assert np.abs(np.array([699, 499]) - upside_down.pixels - whole.pixels).max() < 0.5

@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.stats import f as f_distribution
 
-from stereoservo.calibration.camera_rig.rig_bundle import rigid
-from stereoservo.calibration.least_squares import Limits, NormalEquations, column_sizes, minimise
+from stereoservo.calibration.least_squares import Limits, NormalEquations, minimise
 from stereoservo.messages.cell_file import Mount
 from stereoservo.numerics.arrays import BoolArray, FloatArray
 
@@ -29,9 +28,9 @@ LENSES: tuple[tuple[int, ...], ...] = (
     (0, 2, 3, 4, 5, 6, 7),
     (0, 1, 2, 3, 4, 5, 6, 7, 8),
 )
-"""Free intrinsics of the nested lens models, out of `INTRINSICS`: one is preferred if left-out poses do not
-refute it.""" INTRINSICS = ("focal length", "aspect", "cu", "cv",
-"k1", "k2", "p1", "p2", "k3") LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
+"""Free intrinsics of the nested lens models, out of `INTRINSICS`."""
+INTRINSICS = ("focal length", "aspect", "cu", "cv", "k1", "k2", "p1", "p2", "k3")
+LEAST_NOISE = np.array([1e-3, 1e-3, 1e-6, 1e-6])
 """Least deviations of pixels [px], and of poses [rad, m]: smaller ones have no effect on any result."""
 OFF_CENTRE = 0.02
 """Prior deviation of the principal point from the middle of the picture [image widths], as cameras are built."""
@@ -140,13 +139,13 @@ class HandEyeProblem:
 
     @cached_property
     def smooth(self) -> FloatArray:
-        """Orthonormal quadratic functions (c, s, m, 6) over the markers that each view shows; zero if they are
-        fewer.""" flat = self.views.layout[:,
-        :2] - self.views.layout[:, :2].mean(axis=0) x,
-        y = (flat / np.abs(flat).max(axis=0)).T functions = np.stack([x**i * y**j for i in range(DEGREE + 1)
-        for j in range(DEGREE + 1 - i)], axis=1) U, sizes, _ = np.linalg.svd(self.views.seen[..., None]
-        * functions, full_matrices=False) functions = np.zeros((*self.views.seen.shape,
-        functions.shape[1])) functions[..., : U.shape[-1]] = U * (sizes > 1e-6 * np.maximum(sizes[..., :1], 1e-9))[..., None, :]
+        """Orthonormal polynomials (c, s, m, k) over the markers that each view shows; zero if they are fewer."""
+        flat = self.views.layout[:, :2] - self.views.layout[:, :2].mean(axis=0)
+        x, y = (flat / np.abs(flat).max(axis=0)).T
+        terms = np.stack([x**i * y**j for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)], axis=1)
+        U, sizes, _ = np.linalg.svd(self.views.seen[..., None] * terms, full_matrices=False)
+        functions = np.zeros((*self.views.seen.shape, terms.shape[1]))
+        functions[..., : U.shape[-1]] = U * (sizes > 1e-6 * np.maximum(sizes[..., :1], 1e-9))[..., None, :]
         return functions
 
     def whitened(self, rows: FloatArray) -> FloatArray:
@@ -344,12 +343,12 @@ class HandEyeFit:
         return np.sqrt(variances)
 
     def misfits(self) -> FloatArray:
-        """Decrease (s,) of the cost if a view's pose were free [sigmas²], all else fitted again; zero if not
-        trusted.""" problem =
-        self.problem _, cross,
-        square = problem.blocks(self.state)
-        prior = problem.prior**2 data = square - prior[:, :,
-        None] * np.eye(6) inverse = np.linalg.inv(square)
+        """Decrease (s,) of the cost if a view's pose were free [sigmas²], all else fitted; zero if not trusted."""
+        problem = self.problem
+        _, cross, square = problem.blocks(self.state)
+        prior = problem.prior**2
+        data = square - prior[:, :, None] * np.eye(6)
+        inverse = np.linalg.inv(square)
         by_shared = cross[..., :-1] - data @ (inverse @ cross[..., :-1])
         known = by_shared @ self.covariance @ by_shared.swapaxes(1, 2) + data @ inverse @ data
         gradient = cross[:, :, -1] - prior * motion_vector(self.state.errors)

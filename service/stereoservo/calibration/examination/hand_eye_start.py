@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from stereoservo.calibration.camera_rig.rig_bundle import rigid
 from stereoservo.calibration.examination.hand_eye_fit import BoardViews, motions
 from stereoservo.messages.cell_file import Mount
-from stereoservo.numerics.arrays import BoolArray, FloatArray, IntArray
+from stereoservo.numerics.arrays import FloatArray, IntArray
 
 AMBIGUOUS = 2.0
 """Ratio of reprojection errors up to which the second solution of a plane's pose is possible."""
