@@ -1,4 +1,4 @@
-"""Folders with a board (`board.json`), pictures and poses of the hand, for ``stereoservo examine``: docs/recordings.md."""
+"""Folders with a board (`board.json`), pictures and poses of the hand, for ``examine``: docs/recordings.md."""
 
 from __future__ import annotations
 
@@ -113,8 +113,9 @@ def board_views(folder: Path, board: Board, numbers: list[int], poses: FloatArra
     found = int(np.isfinite(pixels[0, :, :, 0]).any(axis=1).sum())
     log(f"the board is found in {found} of {len(files)} pictures")
     findings = [] if not drawn else [Finding(
-        "drawings", ",".join(drawn), f"views {', '.join(drawn)}: coloured drawings cover the corners; they were painted over, and "
-        "the corners are less certain", "keep the pictures as the camera takes them, without detections drawn in", len(drawn),
+        "drawings", ",".join(drawn),
+        f"views {', '.join(drawn)}: coloured drawings cover the corners; they were painted over, the corners are uncertain",
+        "keep the pictures as the camera takes them, without detections drawn in", len(drawn),
     )]  # fmt: skip
     return BoardViews(tuple(map(str, numbers)), poses, layout, pixels, np.array([size])), findings
 
@@ -163,14 +164,15 @@ def board_text(report: BoardReport) -> str:
         if one is not None:
             hand = (name == "camera") == (report.mount == "eye_in_hand")
             lines.append(
-                f"  {name} in the {'hand' if hand else 'base'}: " + _numbers(one.translation_mm, one.translation_deviation_mm, "mm")
+                f"  {name} in the {'hand' if hand else 'base'}: "
+                + _numbers(one.translation_mm, one.translation_deviation_mm, "mm")
                 + ", rotation vector " + _numbers(one.rotation_deg, one.rotation_deviation_deg, "deg")
             )  # fmt: skip
     if report.intrinsics:
         lines.append("  " + ", ".join(f"{name} {v:.5g} ± {d:.2g}" for name, (v, d) in report.intrinsics.items()))
         lines.append(
-            f"  errors: corners {report.corner_px:.2g} px, lens and board {report.smooth_px:.2g} px, poses {report.pose_deg:.2g} deg "
-            f"and {report.pose_mm:.2g} mm; {report.used} of {report.views} views"
+            f"  errors: corners {report.corner_px:.2g} px, lens and board {report.smooth_px:.2g} px, "
+            f"poses {report.pose_deg:.2g} deg and {report.pose_mm:.2g} mm; {report.used} of {report.views} views"
         )
     if report.held_out_px:
         lines.append("  left-out views are predicted to " + " and ".join(f"{one:.2f} px" for one in report.held_out_px))
