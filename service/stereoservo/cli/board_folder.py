@@ -114,7 +114,7 @@ def board_views(folder: Path, board: Board, numbers: list[int], poses: FloatArra
     log(f"the board is found in {found} of {len(files)} pictures")
     findings = [] if not drawn else [Finding(
         "drawings", ",".join(drawn),
-        f"views {', '.join(drawn)}: coloured drawings cover the corners; they were painted over, the corners are uncertain",
+        f"views {', '.join(drawn)}: coloured drawings cover the corners, which are uncertain: they were painted over",
         "keep the pictures as the camera takes them, without detections drawn in", len(drawn),
     )]  # fmt: skip
     return BoardViews(tuple(map(str, numbers)), poses, layout, pixels, np.array([size])), findings
