@@ -63,7 +63,8 @@ class Board(msgspec.Struct, frozen=True):
 
     def detector(self) -> Detector:
         """The detector of the board's corners. Raises what the plug-in raises for wrong options."""
-        name, options = "aruco", {"tags": self.tags[:1], "dictionary": self.dictionary}
+        name = "aruco"
+        options: dict[str, Any] = {"tags": self.tags[:1], "dictionary": self.dictionary}
         if self.type != "aruco":
             name = "chessboard"
             options = {"columns": self.corners[0], "rows": self.corners[1], "thorough": True}

