@@ -19,6 +19,7 @@ from stereoservo.calibration.examination.examination import RecordingReport, exa
 from stereoservo.calibration.examination.recorded_views import RecordedViews
 from stereoservo.calibration.known_arm import KINDS, NAMES, free_arm
 from stereoservo.calibration.trial_data import CalibrationError, TrialCamera
+from stereoservo.cli.board_folder import BOARD, board_text, examine_board_folder, read_board
 from stereoservo.cli.output import CommandError, JsonOption, emit, log, read_columns
 from stereoservo.core.state_encoding import StateVersionError, decode_state
 from stereoservo.kinematics.model import CellModel
@@ -30,7 +31,6 @@ from stereoservo.ports import lerobot, plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import CameraObservation, Detector, DriverContext, DriverError, Frame
 from stereoservo.ports.lerobot import UNITS, is_data_set
-from stereoservo.ports.number_files import NumberFileError, read_tree
 from stereoservo.ports.pose_files import PoseFileError, board_poses, picture_sets, pose_paths, read_poses
 from stereoservo.recording.recorded_motion import read_motion
 from stereoservo.recording.replay import RecordingError, recorded_messages
@@ -75,6 +75,10 @@ def examine(
         views = read_data_set(dataset, units, cameras, detector)
     elif any(one is not None for one in (units, cameras, detector)):
         raise CommandError("dataset", f"--units, --cameras and --detector are for LeRobot data sets; {dataset} is none")
+    elif (dataset / BOARD).is_file() and len(picture_sets(dataset)) == 1:
+        found = examine_board_folder(dataset, poses, pose_format)
+        emit(found, board_text(found), json)
+        return
     elif dataset.is_dir():
         views = read_folder(dataset, poses, pose_format)
     elif dataset.is_file():
@@ -311,7 +315,7 @@ def _gone_on(times: FloatArray, states: FloatArray) -> FloatArray:
 
 
 JOINTS, POSES, MARKERS, FRAMES, CAMERAS = ("joints.csv", "poses.csv", "markers.csv", "frames.csv", "cameras.csv")
-DETECTOR, BOARD = "detector.toml", "board.json"
+DETECTOR = "detector.toml"
 POSE_COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 TIME, ORDER = "t", "index"
 STATED_PX = 0.1
@@ -536,11 +540,13 @@ def _pictures_with_poses(
     folder: Path, pictures: dict[str, list[Path]], stated: Path | None, pose_format: str
 ) -> RecordedViews:
     frames, notes = GatheredFrames({}), list[str]()
-    board: tuple[FloatArray, FloatArray, tuple[int, int]] | None = None
+    board = read_board(folder) if (folder / BOARD).is_file() else None
+    layout, first = (np.zeros((0, 3)), 0) if board is None else (board.layout, board.first_id)
+    shown_to: tuple[FloatArray, tuple[int, int]] | None = None
     names = [path.name for path in next(iter(pictures.values()))]
     for camera, paths in pictures.items():
-        detector, points = _board(folder, camera)
-        pixels = np.full((len(paths), 0 if points is None else len(points), 2), np.nan)
+        detector = stated_detector(folder / DETECTOR, camera) if board is None else board.detector()
+        pixels = np.full((len(paths), len(layout), 2), np.nan)
         found: dict[tuple[str, float], tuple[int, int, dict[int, tuple[float, float, float]]]] = {}
         for k, path in enumerate(paths):
             image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -551,8 +557,8 @@ def _pictures_with_poses(
             markers = detected(detector, camera, k, image)
             found[camera, float(k)] = k, 0, markers
             for marker, (u, v, _) in markers.items():
-                if marker < pixels.shape[1]:
-                    pixels[k, marker] = u, v
+                if first <= marker < first + len(layout):
+                    pixels[k, marker - first] = u, v
         shown = sum(bool(markers) for _, _, markers in found.values())
         log(f"camera {camera}: markers in {shown} of {len(paths)} pictures")
         if not shown:
@@ -560,12 +566,12 @@ def _pictures_with_poses(
             frames.sizes.pop(camera, None)
             continue
         frames.seen |= found
-        if board is None and points is not None:
-            board = pixels, points, frames.sizes[camera]
+        if board is not None and shown_to is None:
+            shown_to = pixels, frames.sizes[camera]
     if not frames.sizes:
         raise CommandError("dataset", f"{folder}: {'; '.join(notes)}; is the board as {BOARD} or {DETECTOR} has it?")
     try:
-        motion = None if board is None else board_poses(*board)
+        motion = None if shown_to is None else board_poses(shown_to[0], layout[:, :2], shown_to[1])
         read = read_poses(pose_paths(folder, stated), names, motion, pose_format)
     except PoseFileError as error:
         raise CommandError("dataset", str(error)) from error
@@ -573,36 +579,6 @@ def _pictures_with_poses(
     notes += [str(one) for one in read.findings]
     arm = _arm_of_poses(read.poses[order])
     return replace(gathered_views(frames, read.pictures[order].astype(float), *arm, False), notes=tuple(notes))
-
-
-def _board(folder: Path, camera: str) -> tuple[Detector, FloatArray | None]:
-    """Detector of the board that a folder describes, and the places (m, 2) [m] of its markers; None where unknown."""
-    path = folder / BOARD
-    if not path.is_file():
-        return stated_detector(folder / DETECTOR, camera), None
-    try:
-        tree = read_tree(path)
-        sizes = {name: float(tree[name]) for name in ("rows", "cols", "square_m") if name in tree}
-        kind, rows, columns, side = tree["type"], int(sizes["rows"]), int(sizes["cols"]), sizes["square_m"]
-    except (NumberFileError, KeyError, TypeError, ValueError) as error:
-        raise CommandError(
-            "dataset",
-            f"{path}: {error}; needed are type (chessboard or aruco), rows and cols of inner corners, square_m, for "
-            "aruco also dictionary and tags",
-        ) from error
-    if kind == "chessboard":
-        corners = np.array([(k % columns, k // columns) for k in range(rows * columns)], dtype=np.float64)
-        return _detector(path, kind, {"columns": columns, "rows": rows}, camera), side * corners
-    if kind == "aruco" and isinstance(tags := tree.get("tags"), list):
-        options = {"tags": tags, "dictionary": tree.get("dictionary", "36h11")}
-        square = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
-        places = side * square if len(tags) == 1 else None
-        if places is not None:  # marker c of tag t is 4 t + c
-            places = np.vstack([np.full((4 * int(tags[0]), 2), np.nan), places])
-        return _detector(path, kind, options, camera), places
-    raise CommandError(
-        "dataset", f"{path}: type {kind!r}; chessboard, and aruco with its tags, are valid; or {DETECTOR}"
-    )
 
 
 # -- tables ---------------------------------------------------------------------------------------------------
