@@ -111,9 +111,7 @@ def _directions(plane_at_infinity: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.delete(reflection, k, axis=1))
 
 
-def _estimate_metric(
-    generators: FloatArray, matrices: FloatArray, centroid: FloatArray, flat: FloatArray
-) -> FloatArray:
+def _estimate_metric(generators: FloatArray, matrices: FloatArray, centre: FloatArray, flat: FloatArray) -> FloatArray:
     """Scalar product ``Q`` (3, 3) of directions ``flat`` (4, 3), up to scale: ``RᵀQ + QR = 0`` for rotations ``R``."""
     rows = []
     for G in generators:
@@ -123,7 +121,7 @@ def _estimate_metric(
             R = R / size
             rows.append(np.stack([(multiply(R.T, S) + multiply(S, R)).ravel() for S in _SYMMETRIC], axis=1))
     for P in matrices:
-        m = (P * centroid).sum(axis=1)
+        m = (P * centre).sum(axis=1)
         # Body at the origin, pixels in units of a typical focal length
         centred = np.array([[1, 0, -m[0] / m[2]], [0, 1, -m[1] / m[2]], [0, 0, FOCAL_PX]])
         H = multiply(multiply(centred, P), flat)
