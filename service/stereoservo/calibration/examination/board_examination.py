@@ -131,6 +131,8 @@ def examine_board(
     used, flipped = _ordered_views(views, best)
     if flipped:
         findings += _half_turns(flipped, ordered)
+    if any(one.kind == "translations_only" for one in findings):
+        return _report(views, best, odds, None, findings)
     fit = fit_board(used, best.mount, _start(best, board.matrix))
     if not fit.converged:
         findings.append(Finding(
