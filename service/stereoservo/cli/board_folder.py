@@ -126,12 +126,20 @@ def examine_board_folder(folder: Path, poses: Path | None = None, pose_format: s
         board.ordered,
     )
     covered = [str(numbers[k]) for k in drawn]
-    findings = [] if not drawn else [Finding(
-        "drawings", ",".join(covered),
-        f"views {', '.join(covered)}: coloured drawings cover the corners; they were painted over, the corners are "
-        "uncertain",
-        "keep the pictures as the camera takes them, without detections drawn in", len(drawn),
-    )]  # fmt: skip
+    findings = (
+        []
+        if not drawn
+        else [
+            Finding(
+                "drawings",
+                ",".join(covered),
+                f"views {', '.join(covered)}: coloured drawings cover the corners; they were painted over, the "
+                "corners are uncertain",
+                "keep the pictures as the camera takes them, without detections drawn in",
+                len(drawn),
+            )
+        ]
+    )
     notes = (*map(str, read.findings), *report.notes)
     return msgspec.structs.replace(report, findings=(*findings, *report.findings), notes=notes)
 
@@ -193,8 +201,9 @@ def board_text(report: BoardReport) -> str:
             lines.append(
                 f"  {name} in the {'hand' if hand else 'base'}: "
                 + _numbers(one.translation_mm, one.translation_deviation_mm, "mm")
-                + ", rotation vector " + _numbers(one.rotation_deg, one.rotation_deviation_deg, "deg")
-            )  # fmt: skip
+                + ", rotation vector "
+                + _numbers(one.rotation_deg, one.rotation_deviation_deg, "deg")
+            )
     if report.intrinsics:
         lines.append("  " + ", ".join(f"{name} {v:.5g} ± {d:.2g}" for name, (v, d) in report.intrinsics.items()))
         lines.append(

@@ -26,6 +26,7 @@ import numpy as np
 
 from stereoservo.messages.cell_file import MAX_JOINTS
 from stereoservo.messages.decoding import decoding
+from stereoservo.messages.text_files import decoded_text
 from stereoservo.numerics.arrays import FloatArray
 from stereoservo.ports.devices import JointKindName, JointSpec
 from stereoservo_sim.world.robots import Capsule, Robot, UrdfPosition, capsule_around, rotation_to_axis
@@ -130,22 +131,15 @@ def _parsed(path: Path, notes: list[str]) -> Element:
 
 
 def _decoded(data: bytes, notes: list[str]) -> str:
-    """Text of a file by its byte order mark or zeros, else UTF-8, else as declared, else code page 1252."""
-    zeros = [data[k:2000:2].count(0) * 5 > len(data[:2000]) for k in (0, 1)]
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or any(zeros) != all(zeros):
-        little = data.startswith(codecs.BOM_UTF16_LE) or zeros[1]
-        return data.decode("utf-16-le" if little else "utf-16-be", "replace").lstrip("\ufeff").rstrip("\0")
-    try:
-        return data.decode("utf-8-sig").rstrip("\0")
-    except UnicodeDecodeError as error:
-        declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([\w.-]+)", data)
-        name = declared[1].decode() if declared else ""
-        with suppress(LookupError, UnicodeError):
-            if codecs.lookup(name).name != "utf-8":
-                return data.decode(name)
-        line = data.count(b"\n", 0, error.start) + 1
-        notes.append(f"line {line} is not UTF-8: the file is read in code page 1252")
-        return data.decode("cp1252", "replace").rstrip("\0")
+    """Text of a file, in the encoding that it declares where that is none of Unicode."""
+    declared = re.match(rb"\s*<\?xml[^>]*encoding=[\"']([\w.-]+)", data)
+    name = declared[1].decode() if declared else "utf-8"
+    with suppress(LookupError, UnicodeError):
+        if not codecs.lookup(name).name.startswith("utf"):
+            return data.decode(name)
+    text, remarks = decoded_text(data)
+    notes += [str(remark) for remark in remarks]
+    return text
 
 
 def _name(element: Element) -> str:

@@ -281,11 +281,11 @@ def test_what_is_beside_the_arm_or_before_it_stands_still_and_is_told(tmp_path: 
     ("encoded", "told"),
     [
         (lambda text: text.encode("utf-8-sig"), ""),
-        (lambda text: text.encode("utf-16"), ""),
-        (lambda text: text.encode("utf-16-be"), ""),
-        (lambda text: text.encode("cp1252"), "line 2 is not UTF-8"),
+        (lambda text: text.encode("utf-16"), "in UTF-16-LE"),
+        (lambda text: text.encode("utf-16-be"), "in UTF-16-BE"),
+        (lambda text: text.encode("cp1252"), "is not UTF-8"),
         (lambda text: text.replace("utf-8", "cp1252").encode("cp1252"), ""),
-        (lambda text: ("\r\n " + text).encode() + b"\0\0", ""),
+        (lambda text: ("\r\n " + text).encode() + b"\0\0", "2 zero bytes"),
     ],
 )
 def test_files_of_any_encoding_are_read(tmp_path: Path, encoded: Callable[[str], bytes], told: str) -> None:

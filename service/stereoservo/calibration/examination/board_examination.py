@@ -22,13 +22,14 @@ from stereoservo.calibration.examination.hand_eye_fit import (
     motion_vector,
     predicted_errors,
 )
-from stereoservo.calibration.examination.hand_eye_start import board_poses, half_turn
-from stereoservo.calibration.examination.pose_mistakes import (
+from stereoservo.calibration.examination.hand_eye_start import (
     LEAST_ODDS,
     LEAST_TURN_DEG,
     LEAST_VIEWS,
     Explained,
+    board_poses,
     explanations,
+    half_turn,
     log_odds,
     rotations_of,
 )
@@ -112,8 +113,9 @@ def examine_board(
             f"the board is found in {seen} of {len(views.names)} pictures; {LEAST_VIEWS} are needed: check the "
             f"counts of "
             "its corners, its dictionary, and that all of it is in the picture",
-            value=seen, limit=LEAST_VIEWS,
-        )  # fmt: skip
+            value=seen,
+            limit=LEAST_VIEWS,
+        )
     findings = _same_poses(views)
     found = explanations(board, views.poses, turns=True)
     given = next(one for one in found if one.reading.kind == "as_given")
@@ -135,12 +137,16 @@ def examine_board(
         return _report(views, best, odds, None, findings)
     fit = fit_board(used, best.mount, _start(best, board.matrix))
     if not fit.converged:
-        findings.append(Finding(
-            "not_fitted", "", f"the fit did not converge; the poses explain the board to "
-            f"{1e3 * np.median(best.form.shifts):.3g}"
-            f" mm and {np.degrees(np.median(best.form.turns)):.3g} deg (median)",
-            "see the other findings first; else take twenty views that turn the hand about two axes",
-        ))  # fmt: skip
+        findings.append(
+            Finding(
+                "not_fitted",
+                "",
+                f"the fit did not converge; the poses explain the board to "
+                f"{1e3 * np.median(best.form.shifts):.3g}"
+                f" mm and {np.degrees(np.median(best.form.turns)):.3g} deg (median)",
+                "see the other findings first; else take twenty views that turn the hand about two axes",
+            )
+        )
         return _report(views, best, odds, None, findings)
     findings += _of_scale(fit) + _of_views(fit)
     findings += _undetermined(fit, travel)
@@ -178,12 +184,17 @@ def _same_poses(views: BoardViews) -> list[Finding]:
     if not pairs:
         return []
     text = ", ".join(f"{one} and {other}" for one, other in pairs[:5]) + (", …" if len(pairs) > 5 else "")
-    return [Finding(
-        "same_pose", pairs[0][1], f"the same pose stands at views {text}",
-        "if the arm had moved between the pictures, the pose was read before it arrived: read it at rest; if "
-        "not, one of "
-        "the two views adds nothing", len(pairs),
-    )]  # fmt: skip
+    return [
+        Finding(
+            "same_pose",
+            pairs[0][1],
+            f"the same pose stands at views {text}",
+            "if the arm had moved between the pictures, the pose was read before it arrived: read it at rest; if "
+            "not, one of "
+            "the two views adds nothing",
+            len(pairs),
+        )
+    ]
 
 
 def _of_reading(best: Explained, given: Explained, found: list[Explained]) -> Finding:
@@ -221,22 +232,36 @@ def _little_rotation(extent: FloatArray, axis: str) -> Finding:
     elif extent[1] < 2.0:
         kind, text = "one_axis", f"about one axis only ({axis}, {extent[0]:.0f} deg)"
     return Finding(
-        kind, "", f"the hand turns {text}; the translation of the hand-eye transform needs {LEAST_TURN_DEG:.0f} "
+        kind,
+        "",
+        f"the hand turns {text}; the translation of the hand-eye transform needs {LEAST_TURN_DEG:.0f} "
         f"deg about two axes",
         f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two axes; further views like these do not help",
-        float(extent[1]), None, LEAST_TURN_DEG, "deg",
-    )  # fmt: skip
+        float(extent[1]),
+        None,
+        LEAST_TURN_DEG,
+        "deg",
+    )
 
 
 def _of_mount(mount: Mount, stated: Mount | None, odds: float) -> list[Finding]:
     if stated is None or stated == mount or odds < LEAST_ODDS:
         return []
-    return [Finding(
-        "mount", "", f"the camera is stated as {PLACES[stated]}; the pictures fit only one that is "
-        f"{PLACES[mount]} (log-odds "
-        f"{odds:.0f}), or else the poses are inverted, of the base in the hand: the data do not distinguish the two",
-        "correct the mount, or invert the poses", odds, None, LEAST_ODDS, "", "inverted_poses",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "mount",
+            "",
+            f"the camera is stated as {PLACES[stated]}; the pictures fit only one that is "
+            f"{PLACES[mount]} (log-odds {odds:.0f}), or else the poses are inverted, of the base in the hand: the data "
+            "do not distinguish the two",
+            "correct the mount, or invert the poses",
+            odds,
+            None,
+            LEAST_ODDS,
+            "",
+            "inverted_poses",
+        )
+    ]
 
 
 def _half_turns(flipped: list[str], ordered: bool) -> list[Finding]:
@@ -285,12 +310,20 @@ def _of_scale(fit: HandEyeFit) -> list[Finding]:
             ]
     layout = fit.problem.views.layout
     side = 1e3 * float(np.linalg.norm(layout[1] - layout[0]))
-    return [Finding(
-        "square", "", f"the board's square (or tag) is {scale * side:.4g} ± {deviation * side:.2g} mm by the "
-        f"arm's metres, not "
-        f"{side:.4g} mm", f"measure it, over several squares, and state {scale * side:.4g} mm if that is so",
-        float(scale * side), float(deviation * side), side, "mm",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "square",
+            "",
+            f"the board's square (or tag) is {scale * side:.4g} ± {deviation * side:.2g} mm by the "
+            f"arm's metres, not "
+            f"{side:.4g} mm",
+            f"measure it, over several squares, and state {scale * side:.4g} mm if that is so",
+            float(scale * side),
+            float(deviation * side),
+            side,
+            "mm",
+        )
+    ]
 
 
 def _of_views(fit: HandEyeFit) -> list[Finding]:
@@ -299,23 +332,39 @@ def _of_views(fit: HandEyeFit) -> list[Finding]:
     errors = np.sqrt(np.nanmean((predicted_errors(fit, problem.views) ** 2).sum(axis=-1), axis=(0, 2)))
     usual = float(np.median(errors[problem.trusted]))
     for k in np.flatnonzero(~problem.trusted):
-        found.append(Finding(
-            "view", problem.views.names[k], f"view {problem.views.names[k]} does not fit: {errors[k]:.3g} px, "
-            f"the others {usual:.3g} "
-            "px (median); it is left out", "was the arm still moving, or the pose of another picture? Take it again",
-            float(errors[k]), None, usual, "px",
-        ))  # fmt: skip
+        found.append(
+            Finding(
+                "view",
+                problem.views.names[k],
+                f"view {problem.views.names[k]} does not fit: {errors[k]:.3g} px, "
+                f"the others {usual:.3g} "
+                "px (median); it is left out",
+                "was the arm still moving, or the pose of another picture? Take it again",
+                float(errors[k]),
+                None,
+                usual,
+                "px",
+            )
+        )
     logs = np.log(problem.blur)
     spread = 1.4826 * float(np.median(np.abs(logs - np.median(logs)))) + 0.05
     limit = float(norm.isf(FALSE_ALARM / len(logs)))
     for k in np.flatnonzero((logs - np.median(logs)) / spread > limit):
-        found.append(Finding(
-            "blurred", problem.views.names[k], f"view {problem.views.names[k]}: its corners are uncertain by "
-            f"{problem.noise[0] * problem.blur[k]:.2g} px, those of the others by {problem.noise[0]:.2g} px "
-            f"(blurred, overexposed, or "
-            "drawn over); it counts less", "take it again, sharp and without drawings",
-            float(problem.noise[0] * problem.blur[k]), None, float(problem.noise[0] * np.exp(limit * spread)), "px",
-        ))  # fmt: skip
+        found.append(
+            Finding(
+                "blurred",
+                problem.views.names[k],
+                f"view {problem.views.names[k]}: its corners are uncertain by "
+                f"{problem.noise[0] * problem.blur[k]:.2g} px, those of the others by {problem.noise[0]:.2g} px "
+                f"(blurred, overexposed, or "
+                "drawn over); it counts less",
+                "take it again, sharp and without drawings",
+                float(problem.noise[0] * problem.blur[k]),
+                None,
+                float(problem.noise[0] * np.exp(limit * spread)),
+                "px",
+            )
+        )
     return found
 
 
@@ -324,13 +373,20 @@ def _undetermined(fit: HandEyeFit, travel: float) -> list[Finding]:
     deviation = np.sqrt(np.linalg.eigvalsh(fit.covariance[q + 3 : q + 6, q + 3 : q + 6])[-1])
     if deviation < travel:
         return []
-    return [Finding(
-        "undetermined", "", f"the camera's place is not determined along one direction: {1e3 * deviation:.3g} "
-        f"mm, the hand moved by "
-        f"{1e3 * travel:.3g} mm in all; intrinsics, errors and predictions hold all the same",
-        f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two "
-        f"axes", 1e3 * float(deviation), None, 1e3 * travel, "mm",
-    )]  # fmt: skip
+    return [
+        Finding(
+            "undetermined",
+            "",
+            f"the camera's place is not determined along one direction: {1e3 * deviation:.3g} "
+            f"mm, the hand moved by "
+            f"{1e3 * travel:.3g} mm in all; intrinsics, errors and predictions hold all the same",
+            f"turn the hand by {LEAST_TURN_DEG:.0f} deg or more about two axes",
+            1e3 * float(deviation),
+            None,
+            1e3 * travel,
+            "mm",
+        )
+    ]
 
 
 def _report(
@@ -366,22 +422,32 @@ def _report(
     count = (DEGREE + 1) * (DEGREE + 2) // 2
     own = np.sqrt(count / max(len(views.layout), count)) * problem.noise[1]
     return BoardReport(
-        best.mount, odds, len(views.names), int(problem.trusted.sum()),
-        _transform(np.linalg.inv(state.A[0]), deviations[q : q + 6]), _transform(state.C, deviations[q + 6 : q + 12]),
+        best.mount,
+        odds,
+        len(views.names),
+        int(problem.trusted.sum()),
+        _transform(np.linalg.inv(state.A[0]), deviations[q : q + 6]),
+        _transform(state.C, deviations[q + 6 : q + 12]),
         {INTRINSICS[k]: (float(state.intrinsics[0, k]), float(deviations[i])) for i, k in enumerate(problem.free)},
         (scale, scale * float(deviations[-1]) if problem.scaled else 0.0),
-        float(problem.noise[0]), float(own),
-        0.0 if problem.exact else float(np.degrees(problem.noise[2])), 0.0 if problem.exact else 1e3 *
-        float(problem.noise[3]), (), tuple(findings), tuple(notes),
-    )  # fmt: skip
+        float(problem.noise[0]),
+        float(own),
+        0.0 if problem.exact else float(np.degrees(problem.noise[2])),
+        0.0 if problem.exact else 1e3 * float(problem.noise[3]),
+        (),
+        tuple(findings),
+        tuple(notes),
+    )
 
 
 def _transform(T: FloatArray, deviations: FloatArray) -> Transform:
     vector = motion_vector(T)
     return Transform(
-        tuple(np.degrees(vector[:3]).tolist()), tuple((1e3 * vector[3:]).tolist()),
-        tuple(np.degrees(deviations[:3]).tolist()), tuple((1e3 * deviations[3:]).tolist()),
-    )  # fmt: skip
+        tuple(np.degrees(vector[:3]).tolist()),
+        tuple((1e3 * vector[3:]).tolist()),
+        tuple(np.degrees(deviations[:3]).tolist()),
+        tuple((1e3 * deviations[3:]).tolist()),
+    )
 
 
 def held_out_px(fit: HandEyeFit) -> tuple[float, ...]:

@@ -287,9 +287,12 @@ class HandEyeProblem:
         inner = np.sqrt(np.diagonal(square, axis1=1, axis2=2))
         outer = np.append(width, 1.0)
         return NormalEquations(
-            core / np.outer(outer, outer), cross / (inner[:, :, None] * outer), square / (inner[:, :, None] *
-            inner[:, None]), np.concatenate([width, inner.ravel()]), float(core[-1, -1]),
-        )  # fmt: skip
+            core / np.outer(outer, outer),
+            cross / (inner[:, :, None] * outer),
+            square / (inner[:, :, None] * inner[:, None]),
+            np.concatenate([width, inner.ravel()]),
+            float(core[-1, -1]),
+        )
 
     def retract(self, state: HandEye, x: FloatArray) -> HandEye:
         """The state after steps ``x``: small motions of A and of the errors from the left, of C from the right."""
