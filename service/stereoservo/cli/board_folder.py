@@ -19,6 +19,7 @@ from stereoservo.numerics.arrays import FloatArray, ImageArray
 from stereoservo.ports import plugins
 from stereoservo.ports.clock import MonotonicClock
 from stereoservo.ports.devices import Detector, DriverContext, Frame
+from stereoservo.ports.number_files import NumberFileError, read_tree
 from stereoservo.ports.pose_files import (
     PoseFileError,
     board_poses,
@@ -92,8 +93,8 @@ class Board(msgspec.Struct, frozen=True):
 def read_board(folder: Path) -> Board:
     """The board of a folder. Raises CommandError naming what would be valid."""
     try:
-        return msgspec.json.decode((folder / BOARD).read_bytes(), type=Board)
-    except (OSError, msgspec.DecodeError) as error:
+        return msgspec.convert(read_tree(folder / BOARD), Board, strict=False)
+    except (NumberFileError, msgspec.ValidationError) as error:
         raise CommandError(
             "dataset",
             f"{folder / BOARD}: {cause_of(error)}; valid is "
