@@ -264,7 +264,7 @@ def test_goal_beyond_the_joint_limits_is_refused_with_joint_and_place(bench: Any
         assert reply.reasons[0].threshold == pytest.approx(narrow[5] - 0.01)
         assert reply.reasons[0].value == pytest.approx(goal_q[5], abs=1e-3)
         assert "at the goal joint j6" in reply.message
-        assert "law 'trajectory' looks for another way, and for another posture" in reply.message
+        assert "law 'trajectory' searches for another path, and for another posture" in reply.message
     assert np.abs(np.array(bench.commands)).max() == 0.0
     # Another posture of the arm has the body there, too: law trajectory goes that way.
     assert bench.reply(bench.goal(FeatureTarget(bench.features(goal_q)), law="trajectory")).accepted
