@@ -42,7 +42,7 @@ MODULE_LINES, FUNCTION_LINES = 900, 80
 KERNEL_ARGUMENTS = 6
 PARAMETERS, VERBS = 10, 0
 """Parameters of a function; and verbs of the command line that have more (options are fields of a dataclass)."""
-CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 109_200, 536, 129
+CODE_LINES, FILES, LAYOUT_EXCEPTIONS = 109_210, 536, 129
 """Of the product: lines of code, its files, and statements that are not laid out by the formatter (`# fmt: skip`)."""
 ONE_IMPORTER, ONE_IN_FOLDER = 62, 34
 """Modules that one other module alone imports, and those of them in its own folder: a piece that is not read without

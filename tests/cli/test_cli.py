@@ -159,7 +159,7 @@ def test_doctor_takes_the_name_of_a_shipped_cell_and_lists_them(run: Run) -> Non
         ('"http://operator:Tulpe/77@127.0.0.1:9/v"', "http://***@127.0.0.1:9/v: nobody"),
         ('"http://127.0.0.1:9/v?user=me&pwd=Tulpe"', "http://127.0.0.1:9/v?***: nobody"),
         ('"http://operator:12/Tulpe@127.0.0.1:9/v"', "in user and password '@' is written %40, '/' %2F"),
-        ('"ftp://operator:Tulpe@127.0.0.1/v"', "http://, https:// (MJPEG)"),
+        ('"ftp://operator:Tulpe@127.0.0.1/v"', "http://, https:// (MJPEG, or a snapshot)"),
         ('"operator:Tulpe@127.0.0.1/v.mp4"', "a URL begins with http://"),
         ('["http://operator:Tulpe@127.0.0.1:9/v"]', "an integer or a text in quotes"),
         ('"http://operator:Tulpe"', "not a URL"),

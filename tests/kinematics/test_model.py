@@ -304,7 +304,7 @@ def put(*where):
         (put("projective_to_euclidean", np.zeros((4, 4)).tolist()), "projective_to_euclidean", "invertible"),
         (put("cameras", 0, "matrix", [[1, 2, 3, 4]] * 3), "cameras[0].matrix", "rank 3"),
         (put("cameras", 1, "matrix", np.zeros((3, 4)).tolist()), "cameras[1].matrix", "rank 3"),
-        (put("cameras", 1, "lens", [-5.0, 398.0, 301.0, 400.0]), "cameras[1].lens", "at most 1"),
+        (put("cameras", 1, "lens", [-5.0, 398.0, 301.0, 400.0]), "cameras[1].lens", "at most ±1"),
         (put("generators", 0, (1e200 * np.eye(4)).tolist()), "generators[0]", "is needed"),
         (put("epoch", 10**40), "epoch", r"below 2\^63"),
         (put("schema", True), "schema", "is True"),

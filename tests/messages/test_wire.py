@@ -190,7 +190,7 @@ def test_the_schema_lists_the_laws_that_the_daemon_has() -> None:
         ),
         (
             {"target": {"kind": "wish"}},
-            "target.kind: Invalid value 'wish'; valid: features, points, displacement, taught, joints, incidence",
+            "target.kind: Invalid value 'wish'; valid: features, points, displacement, step, taught, joints, incidence",
         ),
         (
             {"target": {"kind": "features", "set_points": {"left": {"abc": [1, 2]}}}},

@@ -58,6 +58,7 @@ REMEDIES = {
     "too_few_cameras": "connect a second camera that sees the markers at the same time",
     "too_few_markers": "show more markers to both cameras at once: at least 4 at every stop; larger or sharper dots, "
     "another calibration.base",
+    "too_few_views": "take more pictures in which all of the board is seen; check its counts and dictionary",
     "too_few_stops": "raise calibration.stops, or give the joint more range: calibration.base, calibration.range",
     "joint_did_not_move": "the encoder reported no motion: is the joint's brake released, is its name the right one?",
     "joint_without_effect": "the markers did not move with this joint: do they sit behind it, does its drive turn? If "

@@ -39,11 +39,10 @@ from stereoservo.geometry.homogeneous import GeometryError, move_points
 from stereoservo.geometry.moved_cameras import FrameChange, carried_point_covariance
 from stereoservo.kinematics.chain import ProjectiveChain
 from stereoservo.kinematics.denavit_hartenberg import ReadOutError
-from stereoservo.kinematics.metric_frames import metric_frame, scale_length
+from stereoservo.kinematics.metric_frames import metric_frame, rotation, scale_length
 from stereoservo.kinematics.model import CellModel
 from stereoservo.messages.goals import Centre, DisplacementTarget, FeatureTarget, StepTarget, TaughtTarget
 from stereoservo.numerics.arrays import FloatArray
-from stereoservo.planning.motion_frame import axis_rotation
 
 MOUNTED_PX = 5.0
 """Tolerance within which goal and kinematics agree if only cameras changed; otherwise the body was remounted."""
@@ -110,8 +109,7 @@ def resolve_step(
         raise TransferError("a turn is made about the middle of markers: give the centre by markers, not by a point")
     matrix = np.eye(4) if step.matrix is None else np.array(step.matrix).reshape(4, 4)
     if step.matrix is None:
-        angle = float(np.linalg.norm(step.turn))
-        matrix[:3, :3] = axis_rotation(np.array(step.turn) / (angle or 1.0), angle)
+        matrix[:3, :3] = rotation(np.array(step.turn))
         matrix[:3, 3] = step.move
     scene = None
     if step.frame.startswith("scene:"):

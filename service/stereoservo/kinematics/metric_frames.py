@@ -42,6 +42,13 @@ def scale_length(model: CellModel, text: str) -> KnownLength:
         raise ReadOutError("length", str(error)) from error
 
 
+def rotation(vector: FloatArray) -> FloatArray:
+    """Rotation (3, 3) of a rotation ``vector`` (3,) [rad]. By NumPy alone: the gateway loads no kernels for it."""
+    angle = float(np.linalg.norm(vector))
+    across = np.cross(vector / (angle or 1.0), np.eye(3)).T
+    return np.asarray(np.eye(3) + np.sin(angle) * across + 2.0 * np.sin(0.5 * angle) ** 2 * across @ across)
+
+
 def base_axes(axes: Axes) -> FloatArray:
     """Axes (3, 3) of the base, as columns: along three orthogonal prismatic joints if the arm begins with them, else z
     along the first axis and x towards the first axis of another direction.

@@ -6,13 +6,12 @@ from __future__ import annotations
 
 import codecs
 import csv
+import json
 import re
 import tomllib
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple, TypeVar
-
-import msgspec
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 MOST_ODD = 200
 """Odd lines of a file after which the rest is no TOML; and lost lines of a table that are listed."""
@@ -166,6 +165,7 @@ _JSON_TOKEN = re.compile(
     r"""|(?P<open>[\[{])|(?P<close>[\]}])|(?P<comma>,)|(?P<word>[-+]?[A-Za-z_]+\b)|(?P<space>\s+)|(?P<other>[^\s,\[\]{}"'/#]+|.)""",
     re.DOTALL,
 )
+_HALF = re.compile(r"\\u[dD][89a-fA-F]")
 _WORDS = {"True": "true", "False": "false", "None": "null", "nan": "null", "inf": "null"}
 _WORDS |= dict.fromkeys(("NaN", "Infinity", "-Infinity", "+Infinity", "-inf", "+inf", "-nan", "undefined"), "null")
 
@@ -176,21 +176,31 @@ def json_of(raw: bytes) -> tuple[Any, list[Remark]]:
     """
     text, remarks = decoded_text(raw)
     try:
-        return msgspec.json.decode(text), remarks
-    except msgspec.DecodeError:
+        return _strict_json(text), remarks
+    except ValueError:
         clean, odd = _clean_json(text)
     except RecursionError as error:
         raise ValueError("is nested too deeply") from error
     try:
-        return msgspec.json.decode(clean), sorted([*remarks, *odd])
-    except msgspec.DecodeError as error:
-        place = re.search(r" \(byte ([0-9]+)\)", str(error))
-        if place is None:
-            raise ValueError(f"is no JSON: {error}") from error
-        line = clean.encode()[: int(place[1])].count(b"\n") + 1
-        raise ValueError(f"line {line}: {str(error)[: place.start()]}") from error
+        return _strict_json(clean), sorted([*remarks, *odd])
+    except json.JSONDecodeError as error:
+        raise ValueError(f"line {error.lineno}: {error.msg}") from error
+    except ValueError as error:
+        raise ValueError(f"is no JSON: {error}") from error
     except RecursionError as error:
         raise ValueError("is nested too deeply") from error
+
+
+def _strict_json(text: str) -> Any:
+    """Value of a text in JSON, without NaN, Infinity and half characters. Raises ValueError."""
+    value = json.loads(text, parse_constant=_no_number)
+    if _HALF.search(text):
+        json.dumps(value, ensure_ascii=False).encode()
+    return value
+
+
+def _no_number(name: str) -> NoReturn:
+    raise ValueError(f"{name} is no number of JSON")
 
 
 def _clean_json(text: str) -> tuple[str, list[Remark]]:
