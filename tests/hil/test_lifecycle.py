@@ -297,7 +297,7 @@ def test_a_goal_has_one_end_with_its_cause_whatever_dies(
 def test_a_process_that_hangs_is_replaced(name: str, own: Client, directories: CellDirectories) -> None:
     old = processes(directories)[name]
     os.kill(old, signal.SIGSTOP)
-    eventually("a new one", lambda: processes(directories).get(name, old) != old, 60.0)
+    eventually("a new one", lambda: processes(directories).get(name, old) != old, 90.0)  # 60 s in a request
 
     def told() -> bool:
         try:

@@ -298,6 +298,8 @@ class Gateway:
                     self._heartbeat.beat(REQUEST_S)
                 busy = True
                 take(item)
+        if busy and self._announce_due_s is None:
+            self._heartbeat.beat(GATEWAY_HANG_S)  # a hang from here on is no request's
         while self._stop.enables:
             self._intake.command_query(self._stop.enables.popleft())
         return busy
